@@ -1,0 +1,7 @@
+"""``python -m imudrv``."""
+
+import sys
+
+from imudrv.cli import main
+
+sys.exit(main())

@@ -1,0 +1,327 @@
+"""The calibration of one unit: its certificate, as file and in SI.
+
+Fields have the names and units of the file; the arrays that the mathematics uses are properties beside them.
+"""
+
+import json
+import os
+from typing import Annotated, Final, Literal, Self, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import AfterValidator, JsonValue, model_validator
+from pydantic import Field as Key
+
+from imudrv.config import Matrix3, Model, UtcTime, read, write
+from imudrv.errors import InputError
+from imudrv.imu.compensation import Coefficients, TemperatureTerms
+from imudrv.units import ARCSEC, DEG_PER_H, MM, PPM, UG
+
+Array: TypeAlias = NDArray[np.float64]
+
+NORM_TOLERANCE: Final = 0.1
+"""Most that a row or column of an axes matrix may differ from length 1."""
+MIN_DETERMINANT: Final = 0.5
+"""Least magnitude of an axes matrix's determinant: axes may be exchanged or reversed, not nearly parallel."""
+GAUGE_TOLERANCE_MM: Final = 1e-5
+"""Most that a gauge may be missed: ten times what rounding to six decimals leaves."""
+COVARIANCE_TOLERANCE_MM2: Final = 5e-6
+"""Most that a covariance may miss symmetry and sign: nine entries, each rounded to six decimals."""
+MAX_PROVENANCE: Final = 1 << 18
+"""Largest provenance, characters of JSON."""
+
+Row9: TypeAlias = tuple[float, float, float, float, float, float, float, float, float]
+Matrix9: TypeAlias = tuple[Row9, Row9, Row9, Row9, Row9, Row9, Row9, Row9, Row9]
+
+
+def _axes(matrix: Matrix3) -> Matrix3:
+    C = np.array(matrix)
+    norms = np.concatenate([np.linalg.norm(C, axis=1), np.linalg.norm(C, axis=0)])
+    worst = norms[np.argmax(np.abs(norms - 1.0))]
+    if abs(worst - 1.0) > NORM_TOLERANCE:
+        raise ValueError(
+            f"expected rows and columns of a length within {NORM_TOLERANCE:g} of 1, got one of {worst:.4g}; "
+            "scale belongs to the scale factors"
+        )
+    determinant = np.linalg.det(C)
+    if abs(determinant) < MIN_DETERMINANT:
+        raise ValueError(
+            f"expected three independent axes, |determinant| >= {MIN_DETERMINANT:g}, got {determinant:.3g}"
+        )
+    return matrix
+
+
+def _covariance(rows: Matrix9) -> Matrix9:
+    P = np.array(rows)
+    asymmetry = float(np.max(np.abs(P - P.T)))
+    if asymmetry > COVARIANCE_TOLERANCE_MM2:
+        raise ValueError(
+            f"expected a symmetric matrix, got entries that differ by {asymmetry:.3g} from their mirror"
+        )
+    least = float(np.linalg.eigvalsh(P)[0])
+    if least < -COVARIANCE_TOLERANCE_MM2:
+        raise ValueError(
+            f"expected no negative variance in any direction, got an eigenvalue of {least:.3g} mm^2"
+        )
+    return rows
+
+
+def _serial_number(text: str) -> str:
+    if not text.strip() or text != text.strip() or not text.isprintable():
+        raise ValueError(f"expected printable text that neither begins nor ends with a space, got {text!r}")
+    return text
+
+
+def _provenance(values: dict[str, JsonValue]) -> dict[str, JsonValue]:
+    try:
+        size = len(json.dumps(values, allow_nan=False))
+    except ValueError:
+        raise ValueError("expected finite numbers, got NaN or infinity") from None
+    if size > MAX_PROVENANCE:
+        raise ValueError(f"expected at most {MAX_PROVENANCE} characters, got {size}")
+    return values
+
+
+def _range(limits: tuple[float, float]) -> tuple[float, float]:
+    if not limits[0] < limits[1]:
+        raise ValueError(f"expected the lower temperature first, got {list(limits)}")
+    return limits
+
+
+# Wide enough for any unit of the kind, narrow enough to catch another unit of measure.
+GyroScale = Annotated[float, Key(gt=0, le=1e4)]
+AccelerometerScale = Annotated[float, Key(gt=0, le=1e9)]
+GyroBias = Annotated[float, Key(ge=-3600, le=3600)]
+AccelerometerBias = Annotated[float, Key(ge=-1e5, le=1e5)]
+GyroBiasSlope = Annotated[float, Key(ge=-100, le=100)]
+AccelerometerBiasSlope = Annotated[float, Key(ge=-1e4, le=1e4)]
+ScaleSlope = Annotated[float, Key(ge=-1e3, le=1e3)]
+Celsius = Annotated[float, Key(ge=-100, le=200)]
+Arm = Annotated[float, Key(ge=-1000, le=1000)]
+Axes = Annotated[Matrix3, AfterValidator(_axes)]
+
+
+def _array(values: object, unit: float = 1.0) -> Array:
+    """Make a read-only array of `values`, multiplied by their unit."""
+    array = np.array(values, dtype=np.float64) * unit
+    array.flags.writeable = False
+    return array
+
+
+class Gyro(Model):
+    """The gyros: ``dtheta_b = C_bg @ (scale * N) - bias * tau``."""
+
+    scale_arcsec_per_pulse: tuple[GyroScale, GyroScale, GyroScale]
+    bias_deg_per_h: tuple[GyroBias, GyroBias, GyroBias]
+    C_bg: Axes
+
+    @property
+    def scale_rad_per_pulse(self) -> Array:
+        """Scale factors, rad a pulse, shape (3,), gyro axes."""
+        return _array(self.scale_arcsec_per_pulse, ARCSEC)
+
+    @property
+    def bias_rad_per_s(self) -> Array:
+        """Biases, rad/s, shape (3,), body axes."""
+        return _array(self.bias_deg_per_h, DEG_PER_H)
+
+    @property
+    def C_bg_array(self) -> Array:
+        """Gyro axes to body, shape (3, 3)."""
+        return _array(self.C_bg)
+
+
+class Accelerometer(Model):
+    """The accelerometers: ``dv_b = C_ba @ (N / scale - bias * tau)``."""
+
+    scale_pulse_per_m_s: tuple[AccelerometerScale, AccelerometerScale, AccelerometerScale]
+    bias_ug: tuple[AccelerometerBias, AccelerometerBias, AccelerometerBias]
+    C_ba: Axes
+
+    @property
+    def scale_pulse_per_m_s_array(self) -> Array:
+        """Scale factors, pulses per m/s, shape (3,), accelerometer axes."""
+        return _array(self.scale_pulse_per_m_s)
+
+    @property
+    def bias_m_s2(self) -> Array:
+        """Biases, m/s^2, shape (3,), accelerometer axes."""
+        return _array(self.bias_ug, UG)
+
+    @property
+    def C_ba_array(self) -> Array:
+        """Accelerometer axes to body, shape (3, 3)."""
+        return _array(self.C_ba)
+
+
+class SensingPoints(Model):
+    """Sensing point of each accelerometer from the origin of b, mm, body axes."""
+
+    x: tuple[Arm, Arm, Arm]
+    y: tuple[Arm, Arm, Arm]
+    z: tuple[Arm, Arm, Arm]
+
+
+class SizeEffect(Model):
+    """Where the accelerometers sense, in a stated gauge."""
+
+    r_mm: SensingPoints
+    gauge: Literal["centroid", "x", "y", "z", "given"]
+    covariance_mm2: Annotated[Matrix9, AfterValidator(_covariance)] | None = None
+
+    @model_validator(mode="after")
+    def _origin_is_where_the_gauge_says(self) -> Self:
+        origin = {
+            "centroid": self.r_m.sum(axis=0) / MM,
+            "x": self.r_mm.x,
+            "y": self.r_mm.y,
+            "z": self.r_mm.z,
+            "given": np.zeros(3),
+        }[self.gauge]
+        if np.max(np.abs(origin)) > GAUGE_TOLERANCE_MM:
+            zero = "r_x + r_y + r_z" if self.gauge == "centroid" else f"r_{self.gauge}"
+            raise ValueError(
+                f"expected {zero} = 0 in the gauge {self.gauge}, got {np.round(origin, 6).tolist()} mm; "
+                "move the three points together, or name the gauge that they are in"
+            )
+        return self
+
+    @property
+    def r_m(self) -> Array:
+        """Sensing points, m, shape (3, 3): row i is that of accelerometer i, body axes."""
+        return _array([self.r_mm.x, self.r_mm.y, self.r_mm.z], MM)
+
+    @property
+    def covariance_m2(self) -> Array | None:
+        """Covariance of (r_x, r_y, r_z), m^2, shape (9, 9), in the gauge; None where it is not known."""
+        return None if self.covariance_mm2 is None else _array(self.covariance_mm2, MM * MM)
+
+
+class Temperature(Model):
+    """How biases and scale factors change per kelvin from the reference; the range where that was found."""
+
+    reference_degc: Celsius
+    range_degc: Annotated[tuple[Celsius, Celsius], AfterValidator(_range)]
+    gyro_bias_deg_per_h_per_k: tuple[GyroBiasSlope, GyroBiasSlope, GyroBiasSlope]
+    gyro_scale_ppm_per_k: tuple[ScaleSlope, ScaleSlope, ScaleSlope]
+    accelerometer_bias_ug_per_k: tuple[AccelerometerBiasSlope, AccelerometerBiasSlope, AccelerometerBiasSlope]
+    accelerometer_scale_ppm_per_k: tuple[ScaleSlope, ScaleSlope, ScaleSlope]
+
+    @property
+    def gyro_bias_rad_per_s_per_k(self) -> Array:
+        """Change of the gyro biases, rad/s per kelvin, shape (3,)."""
+        return _array(self.gyro_bias_deg_per_h_per_k, DEG_PER_H)
+
+    @property
+    def gyro_scale_per_k(self) -> Array:
+        """Relative change of the gyro scale factors per kelvin, shape (3,)."""
+        return _array(self.gyro_scale_ppm_per_k, PPM)
+
+    @property
+    def accelerometer_bias_m_s2_per_k(self) -> Array:
+        """Change of the accelerometer biases, m/s^2 per kelvin, shape (3,)."""
+        return _array(self.accelerometer_bias_ug_per_k, UG)
+
+    @property
+    def accelerometer_scale_per_k(self) -> Array:
+        """Relative change of the accelerometer scale factors per kelvin, shape (3,)."""
+        return _array(self.accelerometer_scale_ppm_per_k, PPM)
+
+
+class Calibration(Model):
+    """The certificate of one unit.
+
+    Without `size_effect` it is not compensated; without `temperature` nothing depends on it. `provenance`
+    says how the calibration was found; it is kept as it is.
+    """
+
+    format: Literal["imu50-calibration"]
+    version: Literal[1]
+    serial_number: Annotated[str, Key(max_length=64), AfterValidator(_serial_number)]
+    created: UtcTime
+    gyro: Gyro
+    accelerometer: Accelerometer
+    size_effect: SizeEffect | None = None
+    temperature: Temperature | None = None
+    provenance: Annotated[dict[str, JsonValue], AfterValidator(_provenance)] | None = None
+
+
+def read_calibration(path: str | os.PathLike[str], unit: str | None = None) -> Calibration:
+    """Read a calibration, and make sure that it belongs to the unit.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    unit : str, optional
+        Serial number of the unit that is connected; not given: any.
+
+    Returns
+    -------
+    Calibration
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, has faults, or is the certificate of another unit.
+    """
+    calibration = read(path, Calibration)
+    if unit is not None and unit != calibration.serial_number:
+        raise InputError(
+            f"{os.fspath(path)}: expected the calibration of unit {unit!r}, "
+            f"got that of {calibration.serial_number!r}; give the connected unit's file, or connect that unit"
+        )
+    return calibration
+
+
+def write_calibration(path: str | os.PathLike[str], calibration: Calibration) -> None:
+    """Write a calibration; the file that was there is kept under its date.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    calibration : Calibration
+        Comes back from `read_calibration` bit for bit.
+
+    Raises
+    ------
+    InputError
+        It cannot be written.
+    """
+    write(path, calibration)
+
+
+def coefficients(calibration: Calibration) -> Coefficients:
+    """Put a calibration into the form that the compensation reads.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The certificate.
+
+    Returns
+    -------
+    Coefficients
+        SI.
+    """
+    gyro, accelerometer, terms = calibration.gyro, calibration.accelerometer, calibration.temperature
+    return Coefficients(
+        gyro_scale=gyro.scale_rad_per_pulse,
+        gyro_bias=gyro.bias_rad_per_s,
+        C_bg=gyro.C_bg_array,
+        accelerometer_scale=accelerometer.scale_pulse_per_m_s_array,
+        accelerometer_bias=accelerometer.bias_m_s2,
+        C_ba=accelerometer.C_ba_array,
+        r_b=calibration.size_effect.r_m if calibration.size_effect else None,
+        temperature=TemperatureTerms(
+            terms.reference_degc,
+            *terms.range_degc,
+            gyro_bias=terms.gyro_bias_rad_per_s_per_k,
+            gyro_scale=terms.gyro_scale_per_k,
+            accelerometer_bias=terms.accelerometer_bias_m_s2_per_k,
+            accelerometer_scale=terms.accelerometer_scale_per_k,
+        )
+        if terms
+        else None,
+    )

@@ -1,0 +1,33 @@
+"""The error tree: short, and each branch says whose fault it is.
+
+A message says what was expected, what came, where, and what to do. The command line turns
+:class:`InputError` into exit code 2; anything else that escapes is a defect of this product.
+"""
+
+from collections.abc import Sequence
+
+
+class Imu50Error(Exception):
+    """Anything that this product raises on purpose."""
+
+
+class InputError(Imu50Error):
+    """What the user gave cannot be used: a file, an option, a value."""
+
+
+class FileFaults(InputError):
+    """A settings file with faults, all of them told at once.
+
+    Parameters
+    ----------
+    path : str
+        The file.
+    faults : sequence of str
+        One sentence a fault, each beginning with the place inside the file.
+    """
+
+    def __init__(self, path: str, faults: Sequence[str]) -> None:
+        self.path = path
+        self.faults = tuple(faults)
+        count = "1 fault" if len(self.faults) == 1 else f"{len(self.faults)} faults"
+        super().__init__("\n  ".join([f"{path}: {count}", *self.faults]))

@@ -1,0 +1,107 @@
+"""What flows: numpy record arrays with time along the first axis, one row live, millions offline.
+
+    bytes -> FRAME -> PULSES -> INCREMENTS
+
+A name without a frame in it is on the sensors' own axes; ``dtheta_b`` and ``dv_b`` are in body axes.
+"""
+
+from enum import IntEnum, IntFlag
+from typing import Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+Records: TypeAlias = NDArray[np.void]
+
+MAX_TEMPERATURES: Final = 6
+"""Temperature channels that a profile may have."""
+
+NO_TEMPERATURE: Final = -(2**31)
+"""Temperature counts of a channel that has not been heard yet."""
+
+MESSAGE: Final = np.dtype(
+    [
+        ("t_ns", np.int64),  # arrival, host clock; from a log: its own time
+        ("id", np.uint32),
+        ("length", np.uint8),  # of the data, bytes
+        ("fd", np.uint8),  # 1: CAN FD
+        ("data", np.uint8, 64),  # zeros behind the length
+    ],
+    align=True,
+)
+"""One CAN message."""
+
+FRAME: Final = np.dtype(
+    [
+        ("counter", np.int64),  # as on the wire, modulo 2^bits
+        ("offset", np.int64),  # of the first byte in the stream (CAN: index of the completing message)
+        ("t_ns", np.int64),  # arrival of the bytes that completed the frame, host clock
+        ("gyro", np.int32, 3),  # pulses, or running totals modulo 2^bits
+        ("accelerometer", np.int32, 3),
+        ("temperature", np.int32, MAX_TEMPERATURES),  # counts; the profile knows the unit
+        ("status", np.uint32),
+        ("damaged", np.int32),  # frames' worth of rejected bytes since the frame before
+        ("torn", np.int32),  # CAN samples given up half-complete since the frame before
+    ],
+    align=True,
+)
+"""One good frame as the wire had it."""
+
+PULSES: Final = np.dtype(
+    [
+        ("counter", np.int64),  # unwrapped
+        ("arrival_ns", np.int64),  # host clock
+        ("elapsed_ns", np.int64),  # end of the interval by the counter alone, from the first sample's beginning
+        ("interval_ns", np.int64),  # that the pulses cover
+        ("gyro", np.int64, 3),
+        ("accelerometer", np.int64, 3),
+        ("temperature_degc", np.float64, MAX_TEMPERATURES),  # NaN: not known
+        ("status", np.uint32),
+        ("flags", np.uint32),
+    ],
+    align=True,
+)
+"""One sample of pulse increments, accounted for."""
+
+INCREMENTS: Final = np.dtype(
+    [
+        ("counter", np.int64),
+        ("t_ns", np.int64),  # end of the interval
+        ("interval_ns", np.int64),
+        ("dtheta_b", np.float64, 3),  # rad
+        ("dv_b", np.float64, 3),  # m/s
+        ("flags", np.uint32),
+    ],
+    align=True,
+)
+"""One sample of compensated increments, body axes."""
+
+REJECT: Final = np.dtype([("offset", np.int64), ("length", np.int64), ("reason", np.int64)])
+"""A stretch of input that is not a frame."""
+
+
+class Reason(IntEnum):
+    """Why a stretch of input is not a frame."""
+
+    NO_SYNC = 1
+    CHECK_FAILED = 2
+    UNFINISHED = 3
+    FOREIGN_ID = 4
+    WRONG_LENGTH = 5
+    TORN = 6
+    STALE = 7
+    NOT_A_MESSAGE = 8
+
+
+class Flag(IntFlag):
+    """Flags of a sample, bit for bit those of the output datagram (ICD, section 7)."""
+
+    VALID = 1 << 0
+    MISSING_BEFORE = 1 << 1
+    LONG_INTERVAL = 1 << 2
+    SATURATED = 1 << 3
+    FAULT = 1 << 4
+    TEMPERATURE_RANGE = 1 << 5
+    SIZE_EFFECT = 1 << 6
+    CLOCK_UNLOCKED = 1 << 7
+    WARM_UP = 1 << 8

@@ -1,0 +1,245 @@
+"""What a bad line does: frames damaged, lost, doubled; messages lost, doubled, swapped; silences.
+
+Random, by seed: the same seed fed the same chunks gives the same faults. Other chunks give other ones.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imudrv.errors import InputError
+from imudrv.records import Records
+from imudrv.sim.scenario import Faults, Silence
+from imudrv.units import NS
+
+Bytes = NDArray[np.uint8]
+_LONGEST: Final = 12
+_MOST_FLIPS: Final = 3
+_TRIES: Final = 16
+
+
+class Kind(IntEnum):
+    """What was done to a frame or message."""
+
+    NONE = 0
+    BIT_FLIPS = 1
+    BYTES_LOST = 2
+    BYTES_INSERTED = 3
+    FALSE_SYNC_INSIDE = 4
+    LOST = 5
+    BYTES_BETWEEN = 6
+    FALSE_SYNC_BETWEEN = 7
+    DOUBLED = 8
+    SWAPPED = 9
+    SILENCE = 10
+
+
+_HARM: Final = (
+    Kind.BIT_FLIPS,
+    Kind.BYTES_LOST,
+    Kind.BYTES_INSERTED,
+    Kind.FALSE_SYNC_INSIDE,
+    Kind.LOST,
+    Kind.SILENCE,
+)
+
+
+@dataclass(frozen=True)
+class Damage:
+    """What was done to the rows that were fed.
+
+    Attributes
+    ----------
+    hit : ndarray of bool, shape (n,)
+        The frame or message does not arrive as it was sent. Bytes between frames, doubles and swaps hit
+        nothing.
+    kind : ndarray of uint8, shape (n,)
+        A `Kind` each.
+    """
+
+    hit: NDArray[np.bool_]
+    kind: NDArray[np.uint8]
+
+
+class StreamFaults:
+    """Faults of a serial line.
+
+    Parameters
+    ----------
+    faults : Faults
+        Of the scenario; `stream` and `silences` are used.
+    header : bytes
+        The bytes that a frame begins with, for false syncs.
+    seed : int
+        Same seed and same chunks, same faults.
+    """
+
+    def __init__(self, faults: Faults, header: bytes, seed: int) -> None:
+        rates = faults.stream
+        self._odds = (
+            (Kind.BIT_FLIPS, rates.bit_flips),
+            (Kind.BYTES_LOST, rates.bytes_lost),
+            (Kind.BYTES_INSERTED, rates.bytes_inserted),
+            (Kind.FALSE_SYNC_INSIDE, rates.false_sync_inside),
+            (Kind.LOST, rates.frame_lost),
+            (Kind.BYTES_BETWEEN, rates.bytes_between),
+            (Kind.FALSE_SYNC_BETWEEN, rates.false_sync_between),
+            (Kind.DOUBLED, rates.frame_doubled),
+        )
+        self._silences = faults.silences
+        self._header = header
+        self._rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(5,)))
+        self._act: dict[Kind, Callable[[bytes], bytes]] = {
+            Kind.BIT_FLIPS: self._flip,
+            Kind.BYTES_LOST: self._lose,
+            Kind.BYTES_INSERTED: lambda frame: self._insert(frame, self._random()),
+            Kind.FALSE_SYNC_INSIDE: lambda frame: self._insert(frame, header),
+            Kind.LOST: lambda frame: b"",
+            Kind.BYTES_BETWEEN: lambda frame: self._random() + frame,
+            Kind.FALSE_SYNC_BETWEEN: lambda frame: header + frame,
+            Kind.DOUBLED: lambda frame: frame + frame,
+            Kind.SILENCE: lambda frame: b"",
+        }
+
+    def apply(self, frames: Bytes, t_ns: NDArray[np.int64]) -> tuple[bytes, Damage]:
+        """Send frames over the line.
+
+        Parameters
+        ----------
+        frames : ndarray of uint8, shape (n, length)
+            A frame a row.
+        t_ns : ndarray of int64, shape (n,)
+            When each is sent, from the beginning of the run.
+
+        Returns
+        -------
+        bytes
+            What arrives.
+        Damage
+            A row a frame.
+
+        Raises
+        ------
+        InputError
+            Not as many times as frames, or frames too short to be damaged inside.
+        """
+        n, length = frames.shape
+        if t_ns.shape != (n,) or length < 2:
+            raise InputError(
+                "faults: expected n frames of 2 bytes or more and n times, "
+                f"got shapes {frames.shape} and {t_ns.shape}"
+            )
+        kind = _kinds(self._odds, self._silences, t_ns, self._rng)
+        pieces = []
+        done = 0
+        for i in np.flatnonzero(kind).tolist():
+            frame = frames[i].tobytes()
+            arrives = self._harm(Kind(kind[i]), frame)
+            if arrives == frame:
+                kind[i] = Kind.NONE
+            pieces += [frames[done:i].tobytes(), arrives]
+            done = i + 1
+        pieces.append(frames[done:].tobytes())
+        return b"".join(pieces), _damage(kind)
+
+    def _harm(self, kind: Kind, frame: bytes) -> bytes:
+        """Harm a frame; it stays whole where chance would leave it readable time after time."""
+        act = self._act[kind]
+        if kind not in _HARM:
+            return act(frame)
+        for _ in range(_TRIES):
+            arrives = act(frame)
+            # a frame that lost its last bytes may find the same in the next one's header
+            if frame not in arrives + self._header[: len(frame) - 1]:
+                return arrives
+        return frame
+
+    def _flip(self, frame: bytes) -> bytes:
+        bits = self._rng.choice(8 * len(frame), self._rng.integers(1, _MOST_FLIPS + 1), replace=False)
+        damaged = bytearray(frame)
+        for bit in bits.tolist():
+            damaged[bit // 8] ^= 1 << bit % 8
+        return bytes(damaged)
+
+    def _lose(self, frame: bytes) -> bytes:
+        run = int(self._rng.integers(1, min(_LONGEST, len(frame) - 1) + 1))
+        at = int(self._rng.integers(0, len(frame) - run + 1))
+        return frame[:at] + frame[at + run :]
+
+    def _insert(self, frame: bytes, more: bytes) -> bytes:
+        at = int(self._rng.integers(1, len(frame)))
+        return frame[:at] + more + frame[at:]
+
+    def _random(self) -> bytes:
+        return self._rng.bytes(int(self._rng.integers(1, _LONGEST + 1)))
+
+
+class MessageFaults:
+    """Faults of a CAN bus.
+
+    Parameters
+    ----------
+    faults : Faults
+        Of the scenario; `can` and `silences` are used.
+    seed : int
+        Same seed and same chunks, same faults.
+    """
+
+    def __init__(self, faults: Faults, seed: int) -> None:
+        rates = faults.can
+        self._odds = ((Kind.LOST, rates.lost), (Kind.DOUBLED, rates.doubled), (Kind.SWAPPED, rates.swapped))
+        self._silences = faults.silences
+        self._rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(5,)))
+
+    def apply(self, messages: Records) -> tuple[Records, Damage]:
+        """Send messages over the bus.
+
+        Parameters
+        ----------
+        messages : ndarray of MESSAGE, shape (n,)
+            With `t_ns` from the beginning of the run.
+
+        Returns
+        -------
+        ndarray of MESSAGE
+            What arrives; messages that change places leave the times where they are.
+        Damage
+            A row a message sent. `SWAPPED` stands at the first of a pair; the last one fed has nothing behind
+            it and stays, as does one before another fault.
+        """
+        kind = _kinds(self._odds, self._silences, messages["t_ns"], self._rng)
+        order = np.arange(messages.size)
+        for i in np.flatnonzero(kind == Kind.SWAPPED).tolist():
+            if kind[i] == Kind.SWAPPED and i + 1 < messages.size and kind[i + 1] in (Kind.NONE, Kind.SWAPPED):
+                order[i], order[i + 1] = i + 1, i
+                kind[i + 1] = Kind.NONE
+            else:
+                kind[i] = Kind.NONE
+        arrives = messages[order]
+        arrives["t_ns"] = messages["t_ns"]
+        copies = np.where(np.isin(kind, _HARM), 0, np.where(kind == Kind.DOUBLED, 2, 1))
+        return np.repeat(arrives, copies), _damage(kind)
+
+
+def _kinds(
+    odds: Sequence[tuple[Kind, float]],
+    silences: Sequence[Silence],
+    t_ns: NDArray[np.int64],
+    rng: np.random.Generator,
+) -> NDArray[np.uint8]:
+    """One kind a row: drawn, and silence where it reigns."""
+    kinds = np.array([kind for kind, _ in odds] + [Kind.NONE], np.uint8)
+    edges = np.cumsum([rate for _, rate in odds])
+    kind = kinds[np.searchsorted(edges, rng.random(t_ns.size), side="right")]
+    for silence in silences:
+        begin, end = round(silence.at_s / NS), round((silence.at_s + silence.duration_s) / NS)
+        kind[(begin < t_ns) & (t_ns <= end)] = Kind.SILENCE
+    return kind
+
+
+def _damage(kind: NDArray[np.uint8]) -> Damage:
+    return Damage(np.isin(kind, _HARM), kind)

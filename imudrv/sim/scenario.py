@@ -1,0 +1,379 @@
+"""The scenario file: what is simulated, checked whole before anything runs.
+
+Segments of the motion follow each other; each begins in the attitude the one before it left, at rest.
+Durations are rounded to whole sample intervals.
+"""
+
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import Field as Key
+from pydantic import model_validator
+
+from imudrv.calibration import Calibration, read_calibration
+from imudrv.config import Model, parse, read
+from imudrv.errors import InputError
+from imudrv.site import Site
+from imudrv.units import NS
+
+Duration = Annotated[float, Key(gt=0, le=1_000_000)]
+Amount = Annotated[float, Key(ge=0, le=1e6)]
+Fraction = Annotated[float, Key(ge=0, le=1)]
+Tilt = Annotated[float, Key(ge=-200, le=200)]
+Offset = Annotated[float, Key(ge=-10_000, le=10_000)]
+Frequency = Annotated[float, Key(gt=0, le=2000)]
+Rate = Annotated[float, Key(ge=0, le=2000)]
+Celsius = Annotated[float, Key(ge=-100, le=200)]
+Limit = Annotated[int, Key(ge=1, le=2**31 - 1)]
+
+
+class Start(Model):
+    """Where the body stands before it moves.
+
+    `z_up`: X east, Y north. `x_up`: Y east, Z north. `y_up`: Z east, X north. Then the body is turned by the
+    heading, clockwise seen from above, and its upper axis leans by `tilt_mrad` to the east and to the north.
+    The pivot is the fixed point of every rotation; the origin of b lies `pivot_offset_mm` from it, in b.
+    """
+
+    pose: Literal["z_up", "x_up", "y_up"] = "z_up"
+    heading_deg: Annotated[float, Key(ge=-360, le=360)] = 0.0
+    tilt_mrad: tuple[Tilt, Tilt] = (0.0, 0.0)
+    pivot_offset_mm: tuple[Offset, Offset, Offset] = (0.0, 0.0, 0.0)
+    counter: Annotated[int, Key(ge=0, lt=2**48)] = 0
+
+
+class Rest(Model):
+    """Nothing moves."""
+
+    duration_s: Duration
+
+
+class Rotate(Model):
+    """A turn from rest to rest, right-handed about an axis fixed on the bench; the quintic, of least jerk.
+
+    The axis is the vertical, leaning by `axis_tilt_mrad` to the east and to the north, or it is `axis_n`.
+    """
+
+    angle_deg: Annotated[float, Key(ge=-36_000, le=36_000)]
+    duration_s: Annotated[float, Key(ge=0.05, le=1_000_000)]
+    axis_tilt_mrad: tuple[Tilt, Tilt] | None = None
+    axis_n: tuple[float, float, float] | None = None
+
+    @model_validator(mode="after")
+    def _one_axis(self) -> Self:
+        if self.axis_tilt_mrad is not None and self.axis_n is not None:
+            raise ValueError("expected axis_tilt_mrad or axis_n, got both")
+        if self.axis_n is not None and max(map(abs, self.axis_n)) < 1e-3:
+            raise ValueError(
+                f"axis_n: expected a direction, with a component of 0.001 at least, got {self.axis_n}"
+            )
+        return self
+
+
+class _Random(Model):
+    """Random motion in a band, faded in and out over `ramp_s`, ending at rest where it began."""
+
+    duration_s: Annotated[float, Key(gt=0, le=36_000)]
+    band_hz: tuple[Frequency, Frequency]
+    ramp_s: Duration = 1.0
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        if not self.band_hz[0] < self.band_hz[1]:
+            raise ValueError(f"band_hz: expected the lower frequency first, got {list(self.band_hz)}")
+        if 2.0 * self.ramp_s > self.duration_s:
+            raise ValueError(
+                f"ramp_s: expected half of duration_s at most, got {self.ramp_s:g} of {self.duration_s:g}"
+            )
+        return self
+
+
+class Rock(_Random):
+    """Random rocking: rotations about X, then the turned Y, then the turned Z, each with its own rate.
+
+    `rate_rms_deg_per_s` belongs to these three rotations between the ramps; for small angles they are the
+    body's rates. One that would beat `rate_peak_deg_per_s` at the end of a sample is made smaller as a whole.
+    `sway_mm` is the rms way of the pivot east, north and up, for a unit carried by hand.
+    """
+
+    rate_rms_deg_per_s: tuple[Rate, Rate, Rate]
+    rate_peak_deg_per_s: Annotated[float, Key(gt=0, le=10_000)] | None = None
+    sway_mm: tuple[Amount, Amount, Amount] = (0.0, 0.0, 0.0)
+
+
+class Vibrate(_Random):
+    """Random vibration of the pivot, `g_rms` east, north and up, and what the bench answers in rotation."""
+
+    g_rms: tuple[Rate, Rate, Rate]
+    rate_rms_deg_per_s: tuple[Rate, Rate, Rate] = (0.0, 0.0, 0.0)
+
+
+class Segment(Model):
+    """One entry of the motion: exactly one of its keys."""
+
+    rest: Rest | None = None
+    rotate: Rotate | None = None
+    rock: Rock | None = None
+    vibrate: Vibrate | None = None
+
+    @model_validator(mode="after")
+    def _exactly_one(self) -> Self:
+        given = [name for name in ("rest", "rotate", "rock", "vibrate") if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise ValueError(
+                f"expected one of rest, rotate, rock, vibrate, got {' and '.join(given) or 'none'}"
+            )
+        return self
+
+    @property
+    def motion(self) -> Rest | Rotate | Rock | Vibrate:
+        """The one that is given."""
+        motion = self.rest or self.rotate or self.rock or self.vibrate
+        assert motion is not None
+        return motion
+
+
+class Residuals(Model):
+    """1-sigma of what the unit differs by from its calibration, drawn once for each axis."""
+
+    gyro_bias_deg_per_h: Amount = 0.0
+    gyro_scale_ppm: Amount = 0.0
+    gyro_misalignment_urad: Amount = 0.0
+    accelerometer_bias_ug: Amount = 0.0
+    accelerometer_scale_ppm: Amount = 0.0
+    accelerometer_misalignment_urad: Amount = 0.0
+
+
+class Noise(Model):
+    """White noise of the sensors: random walk of angle and velocity."""
+
+    arw_deg_per_sqrt_h: Amount = 0.0
+    vrw_m_s_per_sqrt_h: Amount = 0.0
+
+
+class Dither(Model):
+    """The gyro blocks' dither: `amplitude_arcsec * sin`, about each gyro's own axis, phases random.
+
+    `in_increments` is the fraction that the gyro increments still carry; `case_reaction` the fraction by
+    which the whole body turns.
+    """
+
+    amplitude_arcsec: tuple[Rate, Rate, Rate]
+    frequency_hz: tuple[Frequency, Frequency, Frequency]
+    in_increments: Fraction = 0.0
+    case_reaction: Annotated[float, Key(ge=0, le=0.1)] = 0.0
+
+
+class Temperature(Model):
+    """Course of the temperature, one for all channels: a slope, and an approach to `settles_at_degc`."""
+
+    start_degc: Celsius = 35.0
+    slope_k_per_h: Annotated[float, Key(ge=-1000, le=1000)] = 0.0
+    settles_at_degc: Celsius | None = None
+    time_constant_s: Duration | None = None
+
+    @model_validator(mode="after")
+    def _both_or_neither(self) -> Self:
+        if (self.settles_at_degc is None) != (self.time_constant_s is None):
+            raise ValueError("expected settles_at_degc and time_constant_s together, got one of them")
+        return self
+
+
+class Saturation(Model):
+    """Most pulses that an axis can count in one sample interval; what is beyond is lost."""
+
+    gyro_pulses: Limit = 2**31 - 1
+    accelerometer_pulses: Limit = 2**31 - 1
+
+
+class Unit(Model):
+    """The unit: its calibration (a file, or inline, or else that of the nominal unit) and what spoils it.
+
+    The file is looked for beside the scenario. Residuals make the unit differ from its calibration.
+
+    The accelerometers' sample ends `accelerometer_skew_s` later than the gyros'.
+    """
+
+    calibration_file: Annotated[str, Key(min_length=1, max_length=4096)] | None = None
+    calibration: Calibration | None = None
+    residuals: Residuals = Residuals()
+    noise: Noise = Noise()
+    dither: Dither | None = None
+    accelerometer_skew_s: Annotated[float, Key(ge=-0.01, le=0.01)] = 0.0
+    temperature: Temperature = Temperature()
+    saturation: Saturation = Saturation()
+    warm_up_s: Annotated[float, Key(ge=0, le=1_000_000)] = 0.0
+
+    @model_validator(mode="after")
+    def _one_calibration(self) -> Self:
+        if self.calibration_file is not None and self.calibration is not None:
+            raise ValueError("expected calibration_file or calibration, got both")
+        return self
+
+
+class Silence(Model):
+    """A span in which nothing is sent."""
+
+    at_s: Annotated[float, Key(ge=0, le=1e7)]
+    duration_s: Duration
+
+
+class CounterJump(Model):
+    """From the first sample that ends after `at_s` the counter is further by `by`; backwards is a restart."""
+
+    at_s: Annotated[float, Key(ge=0, le=1e7)]
+    by: Annotated[int, Key(ge=-(2**32), le=2**32)]
+
+
+class StreamRates(Model):
+    """Probability per frame of a serial line's faults; a frame suffers one at the most."""
+
+    bit_flips: Fraction = 0.0
+    bytes_lost: Fraction = 0.0
+    bytes_inserted: Fraction = 0.0
+    false_sync_inside: Fraction = 0.0
+    frame_lost: Fraction = 0.0
+    bytes_between: Fraction = 0.0
+    false_sync_between: Fraction = 0.0
+    frame_doubled: Fraction = 0.0
+
+    @model_validator(mode="after")
+    def _no_more_than_all(self) -> Self:
+        _at_most_one(self)
+        return self
+
+
+class MessageRates(Model):
+    """Probability per message of a CAN bus' faults; a message suffers one at the most."""
+
+    lost: Fraction = 0.0
+    doubled: Fraction = 0.0
+    swapped: Fraction = 0.0
+
+    @model_validator(mode="after")
+    def _no_more_than_all(self) -> Self:
+        _at_most_one(self)
+        return self
+
+
+def _at_most_one(rates: StreamRates | MessageRates) -> None:
+    total = sum(rates.model_dump().values())
+    if total > 1.0:
+        raise ValueError(f"expected probabilities that add up to 1 at most, got {total:g}")
+
+
+class Faults(Model):
+    """What goes wrong on the way."""
+
+    stream: StreamRates = StreamRates()
+    can: MessageRates = MessageRates()
+    silences: Annotated[tuple[Silence, ...], Key(max_length=1000)] = ()
+    counter_jumps: Annotated[tuple[CounterJump, ...], Key(max_length=1000)] = ()
+
+
+class Scenario(Model):
+    """A scenario file."""
+
+    format: Literal["imu50-scenario"]
+    version: Literal[1]
+    seed: Annotated[int, Key(ge=0, lt=2**63)] = 0
+    site: Site
+    start: Start = Start()
+    motion: Annotated[tuple[Segment, ...], Key(min_length=1, max_length=1000)]
+    unit: Unit = Unit()
+    faults: Faults = Faults()
+
+
+NOMINAL = parse(
+    {
+        "format": "imu50-calibration",
+        "version": 1,
+        "serial_number": "nominal",
+        "created": "2026-01-01T00:00:00Z",
+        "gyro": {
+            "scale_arcsec_per_pulse": [0.5, 0.5, 0.5],
+            "bias_deg_per_h": [0.0, 0.0, 0.0],
+            "C_bg": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+        },
+        "accelerometer": {
+            "scale_pulse_per_m_s": [2000.0, 2000.0, 2000.0],
+            "bias_ug": [0.0, 0.0, 0.0],
+            "C_ba": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+        },
+        "size_effect": {
+            "r_mm": {"x": [24.0, -11.0, -9.0], "y": [-23.0, 29.0, -7.0], "z": [-1.0, -18.0, 16.0]},
+            "gauge": "centroid",
+        },
+    },
+    Calibration,
+    "nominal unit",
+)
+"""The unit where the scenario gives none: nominal scales, no errors, arms of some 30 mm."""
+
+
+def shipped() -> list[str]:
+    """Names of the scenarios that come with the package."""
+    return sorted(
+        p.name.removesuffix(".yaml") for p in (resources.files(__package__) / "scenarios").iterdir()
+    )
+
+
+def load(name_or_path: str) -> Scenario:
+    """Load a scenario, by the name of a shipped one or by the path of a file.
+
+    Parameters
+    ----------
+    name_or_path : str
+        ``z-up``, or ``my/run.yaml``.
+
+    Returns
+    -------
+    Scenario
+        Checked; a calibration file has become `unit.calibration`.
+
+    Raises
+    ------
+    InputError
+        No such scenario, or one with faults, or its calibration file has them.
+    """
+    if name_or_path in shipped():
+        with resources.as_file(resources.files(__package__) / "scenarios" / f"{name_or_path}.yaml") as path:
+            return _read(path)
+    if not Path(name_or_path).exists():
+        raise InputError(
+            f"scenario {name_or_path!r}: expected one of {', '.join(shipped())}, "
+            "or the path of a scenario file; there is no such file"
+        )
+    return _read(Path(name_or_path))
+
+
+def _read(path: Path) -> Scenario:
+    scenario = read(path, Scenario)
+    if scenario.unit.calibration_file is None:
+        return scenario
+    calibration = read_calibration(path.parent / scenario.unit.calibration_file)
+    unit = scenario.unit.model_copy(update={"calibration_file": None, "calibration": calibration})
+    return scenario.model_copy(update={"unit": unit})
+
+
+def samples(scenario: Scenario, interval_ns: int) -> int:
+    """How many samples a scenario has; each segment is rounded to whole intervals.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        The scenario.
+    interval_ns : int
+        Sample interval, ns.
+
+    Returns
+    -------
+    int
+    """
+    return sum(intervals(segment.motion.duration_s, interval_ns * NS) for segment in scenario.motion)
+
+
+def intervals(duration_s: float, interval_s: float) -> int:
+    """Sample intervals of a segment: a whole number, at least one."""
+    return max(1, round(duration_s / interval_s))

@@ -1,0 +1,372 @@
+"""The unit: true integrals of motion to pulses, with the unit's own errors, and the truth beside them.
+
+The true unit is a calibration (its file's conventions, taken backwards) that differs by drawn residuals from
+the one that will compensate it:
+
+    gyro axes            N_g = C_bg^-1 (dtheta_b + b_g tau) / k_g
+    accelerometer i      N_i = K_i (integral of f_i + b_i tau)
+
+with `k_g`, `K`, `b_g`, `b` each at the temperature of the sample: the scale in the file times
+`1 + ppm_per_k (T - T_reference)`, the bias plus `bias_per_k (T - T_reference)`. Pulses are whole; their
+fraction is carried into the next sample.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import exp, pi, sin
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from imudrv.errors import InputError
+from imudrv.kernels import kernel
+from imudrv.nav.earth import earth_rate_n, normal_gravity
+from imudrv.nav.vectors import Vector, dot, row
+from imudrv.records import PULSES, Records
+from imudrv.sim.motion import Array, Body, Dithering, Integrals, Motion, cycles_at, split_cycles
+from imudrv.sim.scenario import NOMINAL, Dither, Faults, Scenario
+from imudrv.units import ARCSEC, DEG_PER_H, DEG_PER_SQRT_H, MM, NS, PPM, UG, URAD
+
+PER_SQRT_H: Final = 1.0 / 60.0
+"""One per square root of an hour, 1/sqrt(s)."""
+STATUS_WARM_UP: Final = 1 << 0
+"""Status bit: the unit has not run long enough (ICD, section 2)."""
+STATUS_OVERFLOW: Final = 1 << 10
+"""Status bit: an axis had more pulses than it can count (ICD, section 2)."""
+
+TRUTH: Final = np.dtype(
+    [
+        ("counter", np.int64),
+        ("t_s", np.float64),  # end of the interval, from the beginning of the run
+        ("dtheta_b", np.float64, 3),  # integral of omega_ib_b, rad
+        ("dv_b", np.float64, 3),  # integral of the specific force at the origin of b, m/s
+        ("omega_ib_b", np.float64, 3),  # at the end, rad/s
+        ("C_nb", np.float64, (3, 3)),  # at the end
+    ],
+    align=True,
+)
+"""What really happened in one sample interval."""
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """A stretch of samples.
+
+    Attributes
+    ----------
+    pulses : ndarray of PULSES
+        Times count from the beginning of the run. Flags are zero: they belong to the stage that keeps account
+        of samples.
+    truth : ndarray of TRUTH
+        Row by row the same samples.
+    """
+
+    pulses: Records
+    truth: Records
+
+
+@dataclass(frozen=True)
+class TrueUnit:
+    """The unit as it really is, SI, the last axis that of the sensor or, for matrices, of the file."""
+
+    gyro_scale: Array  # rad per pulse
+    gyro_bias: Array  # rad/s, on body axes
+    C_bg: Array
+    accelerometer_scale: Array  # pulses per m/s
+    accelerometer_bias: Array  # m/s^2
+    C_ba: Array
+    r_b: Array  # (3, 3), row i the sensing point of accelerometer i, m
+    reference_degc: float
+    gyro_bias_per_k: Array
+    gyro_scale_per_k: Array
+    accelerometer_bias_per_k: Array
+    accelerometer_scale_per_k: Array
+
+
+class _Electronics(NamedTuple):
+    """From integrals to pulses, as the kernel takes it; gyro quantities are on the gyros' own axes."""
+
+    interval_s: float
+    G: Array  # C_bg^-1
+    gyro_scale: Array
+    gyro_bias: Array
+    gyro_bias_per_k: Array
+    gyro_scale_per_k: Array
+    gyro_noise: float  # 1 sigma of an increment, rad
+    gyro_limit: float
+    dither: Dithering  # left in the gyro increments
+    accelerometer_scale: Array
+    accelerometer_bias: Array
+    accelerometer_bias_per_k: Array
+    accelerometer_scale_per_k: Array
+    accelerometer_noise: float  # m/s
+    accelerometer_limit: float
+    reference_degc: float
+    start_degc: float
+    slope_k_per_s: float
+    rise_k: float
+    time_constant_s: float
+
+
+def draw(scenario: Scenario) -> TrueUnit:
+    """Draw the true unit: the scenario's calibration and residuals, by the scenario's seed.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        `unit` and `seed` are used; the seed alone decides the shape of the residuals, their 1-sigma the size.
+
+    Returns
+    -------
+    TrueUnit
+    """
+    calibration = scenario.unit.calibration or NOMINAL
+    residuals = scenario.unit.residuals
+    gyro, accelerometer, temperature = calibration.gyro, calibration.accelerometer, calibration.temperature
+    rng = _generator(scenario, 2)
+    gyro_normal, accelerometer_normal = rng.standard_normal((2, 12))
+    none = np.zeros(3)
+    return TrueUnit(
+        gyro_scale=gyro.scale_rad_per_pulse * (1.0 + residuals.gyro_scale_ppm * PPM * gyro_normal[0:3]),
+        gyro_bias=gyro.bias_rad_per_s + residuals.gyro_bias_deg_per_h * DEG_PER_H * gyro_normal[3:6],
+        C_bg=_misaligned(residuals.gyro_misalignment_urad, gyro_normal[6:]) @ gyro.C_bg_array,
+        accelerometer_scale=accelerometer.scale_pulse_per_m_s_array
+        * (1.0 + residuals.accelerometer_scale_ppm * PPM * accelerometer_normal[0:3]),
+        accelerometer_bias=accelerometer.bias_m_s2
+        + residuals.accelerometer_bias_ug * UG * accelerometer_normal[3:6],
+        C_ba=_misaligned(residuals.accelerometer_misalignment_urad, accelerometer_normal[6:])
+        @ accelerometer.C_ba_array,
+        r_b=calibration.size_effect.r_m if calibration.size_effect else np.zeros((3, 3)),
+        reference_degc=temperature.reference_degc if temperature else 0.0,
+        gyro_bias_per_k=temperature.gyro_bias_rad_per_s_per_k if temperature else none,
+        gyro_scale_per_k=temperature.gyro_scale_per_k if temperature else none,
+        accelerometer_bias_per_k=temperature.accelerometer_bias_m_s2_per_k if temperature else none,
+        accelerometer_scale_per_k=temperature.accelerometer_scale_per_k if temperature else none,
+    )
+
+
+def simulate(scenario: Scenario, interval_ns: int, chunk: int = 65_536) -> Iterator[Chunk]:
+    """Run a scenario.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        What is simulated; `faults` matter only by their counter jumps, the rest happens on the wire.
+    interval_ns : int
+        Sample interval; durations of the motion are rounded to whole intervals.
+    chunk : int
+        Samples at a time. Any value gives the same bits.
+
+    Yields
+    ------
+    Chunk
+        Up to `chunk` samples; memory stays that of one chunk.
+
+    Raises
+    ------
+    InputError
+        An interval or chunk that makes no sense.
+    """
+    if not 10_000 <= interval_ns <= 1_000_000_000:
+        raise InputError(f"simulation: expected a sample interval of 10 us to 1 s, got {interval_ns} ns")
+    if chunk < 1:
+        raise InputError(f"simulation: expected chunks of one sample at least, got {chunk}")
+    interval_s = interval_ns * NS
+    truth = draw(scenario)
+    rng = _generator(scenario, 3)
+    # Skewed, an accelerometer's sample is the late part of one interval and the early part of a later one.
+    skew, split_ns = divmod(round(scenario.unit.accelerometer_skew_s / NS), interval_ns)
+    motion = Motion(scenario, _body(scenario, truth, interval_s), interval_ns, split_ns * NS)
+    electronics = _electronics(scenario, truth, interval_s)
+    carry = np.zeros(6)
+    for first in range(0, motion.samples, chunk):
+        n = min(chunk, motion.samples - first)
+        begin = min(0, skew)
+        there = motion.integrals(first + begin, first + n + max(0, skew + 1))
+        own = Integrals(*(a[-begin : n - begin] for a in there))
+        later = skew - begin
+        velocity = there.late[later : later + n] + there.early[later + 1 : later + 1 + n]
+        pulses = np.zeros(n, PULSES)
+        counter = scenario.start.counter + np.arange(first, first + n)
+        t_ns = (np.arange(first, first + n) + 1) * interval_ns
+        pulses["counter"] = counter + jumped(scenario.faults, t_ns)
+        pulses["arrival_ns"] = pulses["elapsed_ns"] = t_ns
+        pulses["interval_ns"] = interval_ns
+        noise = rng.standard_normal((n, 6))
+        counts = np.empty((n, 6), np.int64)
+        degc = np.empty(n)
+        overflow = np.empty(n, np.bool_)
+        _count(electronics, first, own.dtheta_b, velocity, noise, carry, counts, degc, overflow)
+        pulses["gyro"], pulses["accelerometer"] = counts[:, :3], counts[:, 3:]
+        pulses["temperature_degc"] = degc[:, None]
+        warm_up = t_ns * NS <= scenario.unit.warm_up_s
+        pulses["status"] = STATUS_WARM_UP * warm_up + STATUS_OVERFLOW * overflow
+        yield Chunk(pulses, _truth(pulses, own))
+
+
+def jumped(faults: Faults, t_ns: np.ndarray) -> np.ndarray:
+    """How far the counter has jumped.
+
+    Parameters
+    ----------
+    faults : Faults
+        Their `counter_jumps`.
+    t_ns : ndarray of int, shape (n,)
+        Ends of the samples, from the beginning of the run.
+
+    Returns
+    -------
+    ndarray of int64, shape (n,)
+    """
+    total = np.zeros(t_ns.size, np.int64)
+    for jump in faults.counter_jumps:
+        total += jump.by * (t_ns > round(jump.at_s / NS))
+    return total
+
+
+def _generator(scenario: Scenario, stream: int) -> np.random.Generator:
+    return np.random.default_rng(np.random.SeedSequence(scenario.seed, spawn_key=(stream,)))
+
+
+def _misaligned(urad: float, normal: Array) -> Array:
+    E = np.eye(3)
+    E[~np.eye(3, dtype=bool)] = urad * URAD * normal
+    return E
+
+
+def _inverse(matrix: Array) -> Array:
+    return np.asarray(np.linalg.inv(matrix), np.float64)
+
+
+def _body(scenario: Scenario, truth: TrueUnit, interval_s: float) -> Body:
+    site = scenario.site
+    gravity = (
+        site.gravity_m_s2
+        if site.gravity_m_s2 is not None
+        else normal_gravity(site.latitude_rad, site.height_m)
+    )
+    x, y, z = (MM * offset for offset in scenario.start.pivot_offset_mm)
+    dither = scenario.unit.dither
+    return Body(
+        interval_s=interval_s,
+        gravity=gravity,
+        omega_ie_n=earth_rate_n(site.latitude_rad),
+        pivot_to_origin_b=(x, y, z),
+        A=_inverse(truth.C_ba),
+        r_b=np.ascontiguousarray(truth.r_b),
+        case=_dithering(scenario, truth, interval_s, dither.case_reaction if dither else 0.0),
+    )
+
+
+def _dithering(scenario: Scenario, truth: TrueUnit, interval_s: float, fraction: float) -> Dithering:
+    dither = scenario.unit.dither or Dither(amplitude_arcsec=(0.0, 0.0, 0.0), frequency_hz=(1.0, 1.0, 1.0))
+    G = _inverse(truth.C_bg)  # rows: the gyros' sensing directions in b
+    frequency_hz = np.array(dither.frequency_hz)
+    return Dithering(
+        axes_b=G / np.linalg.norm(G, axis=1, keepdims=True),
+        amplitude_rad=fraction * np.array(dither.amplitude_arcsec) * ARCSEC,
+        rate=2.0 * pi * frequency_hz,
+        cycles=split_cycles(frequency_hz, interval_s),
+        phase=_generator(scenario, 4).random(3),
+    )
+
+
+def _electronics(scenario: Scenario, truth: TrueUnit, interval_s: float) -> _Electronics:
+    unit = scenario.unit
+    dither, temperature = unit.dither, unit.temperature
+    settles = temperature.settles_at_degc
+    G = _inverse(truth.C_bg)
+    return _Electronics(
+        interval_s=interval_s,
+        G=G,
+        gyro_scale=truth.gyro_scale,
+        gyro_bias=truth.gyro_bias,
+        gyro_bias_per_k=truth.gyro_bias_per_k,
+        gyro_scale_per_k=truth.gyro_scale_per_k,
+        gyro_noise=unit.noise.arw_deg_per_sqrt_h * DEG_PER_SQRT_H * interval_s**0.5,
+        gyro_limit=float(unit.saturation.gyro_pulses),
+        dither=_dithering(scenario, truth, interval_s, dither.in_increments if dither else 0.0),
+        accelerometer_scale=truth.accelerometer_scale,
+        accelerometer_bias=truth.accelerometer_bias,
+        accelerometer_bias_per_k=truth.accelerometer_bias_per_k,
+        accelerometer_scale_per_k=truth.accelerometer_scale_per_k,
+        accelerometer_noise=unit.noise.vrw_m_s_per_sqrt_h * PER_SQRT_H * interval_s**0.5,
+        accelerometer_limit=float(unit.saturation.accelerometer_pulses),
+        reference_degc=truth.reference_degc,
+        start_degc=temperature.start_degc,
+        slope_k_per_s=temperature.slope_k_per_h / 3600.0,
+        rise_k=0.0 if settles is None else settles - temperature.start_degc,
+        time_constant_s=temperature.time_constant_s or 1.0,
+    )
+
+
+def _truth(pulses: Records, own: Integrals) -> Records:
+    truth = np.empty(pulses.size, TRUTH)
+    truth["counter"] = pulses["counter"]
+    truth["t_s"] = pulses["elapsed_ns"] * NS
+    truth["dtheta_b"], truth["dv_b"] = own.dtheta_b, own.dv_b
+    truth["omega_ib_b"], truth["C_nb"] = own.omega_ib_b, own.C_nb
+    return truth
+
+
+@kernel
+def _count(
+    unit: _Electronics,
+    first: int,
+    dtheta_b: Array,
+    velocity: Array,
+    noise: Array,
+    carry: Array,
+    counts: np.ndarray,
+    degc: Array,
+    overflow: np.ndarray,
+) -> None:
+    """Count the run's samples from `first`, shape (n, 6); `carry` is each axis' fraction of a pulse."""
+    tau = unit.interval_s
+    before = _left(unit.dither, first)
+    for i in range(dtheta_b.shape[0]):
+        t = (first + i + 1) * tau
+        degc[i] = (
+            unit.start_degc + unit.slope_k_per_s * t + unit.rise_k * (1.0 - exp(-t / unit.time_constant_s))
+        )
+        warmer = degc[i] - unit.reference_degc
+        left = _left(unit.dither, first + i + 1)
+        angle_b = (
+            dtheta_b[i, 0] + tau * (unit.gyro_bias[0] + warmer * unit.gyro_bias_per_k[0]),
+            dtheta_b[i, 1] + tau * (unit.gyro_bias[1] + warmer * unit.gyro_bias_per_k[1]),
+            dtheta_b[i, 2] + tau * (unit.gyro_bias[2] + warmer * unit.gyro_bias_per_k[2]),
+        )
+        overflow[i] = False
+        for m in range(3):
+            angle = dot(row(unit.G, m), angle_b) + left[m] - before[m] + unit.gyro_noise * noise[i, m]
+            scale = unit.gyro_scale[m] * (1.0 + warmer * unit.gyro_scale_per_k[m])
+            pulses = _whole(angle / scale, carry, m)
+            counts[i, m] = min(max(pulses, -unit.gyro_limit), unit.gyro_limit)
+            overflow[i] |= abs(pulses) > unit.gyro_limit
+        for m in range(3):
+            bias = unit.accelerometer_bias[m] + warmer * unit.accelerometer_bias_per_k[m]
+            speed = velocity[i, m] + tau * bias + unit.accelerometer_noise * noise[i, 3 + m]
+            scale = unit.accelerometer_scale[m] * (1.0 + warmer * unit.accelerometer_scale_per_k[m])
+            pulses = _whole(speed * scale, carry, 3 + m)
+            counts[i, 3 + m] = min(max(pulses, -unit.accelerometer_limit), unit.accelerometer_limit)
+            overflow[i] |= abs(pulses) > unit.accelerometer_limit
+        before = left
+
+
+@kernel
+def _left(dither: Dithering, interval: int) -> Vector:
+    """Dither's angle that the gyros see at the beginning of an interval."""
+    a = dither.amplitude_rad
+    return (
+        a[0] * sin(2.0 * pi * (cycles_at(dither.cycles[0], interval) + dither.phase[0])),
+        a[1] * sin(2.0 * pi * (cycles_at(dither.cycles[1], interval) + dither.phase[1])),
+        a[2] * sin(2.0 * pi * (cycles_at(dither.cycles[2], interval) + dither.phase[2])),
+    )
+
+
+@kernel
+def _whole(pulses: float, carry: Array, axis: int) -> float:
+    total = carry[axis] + pulses
+    whole: float = np.rint(total)
+    carry[axis] = total - whole
+    return whole

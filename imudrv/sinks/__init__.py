@@ -1,0 +1,1 @@
+"""Out: where pulses and increments go."""

@@ -1,0 +1,29 @@
+"""Where the unit stands: the site file."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field as Key
+
+from imudrv.config import Model
+from imudrv.units import DEG
+
+
+class Site(Model):
+    """A place on the Earth; `gravity_m_s2` is absent where it was not measured."""
+
+    format: Literal["imu50-site"] = "imu50-site"
+    version: Literal[1] = 1
+    latitude_deg: Annotated[float, Key(ge=-90, le=90)]
+    longitude_deg: Annotated[float, Key(ge=-180, le=180)]
+    height_m: Annotated[float, Key(ge=-500, le=9000)]
+    gravity_m_s2: Annotated[float, Key(ge=9.7, le=9.9)] | None = None
+
+    @property
+    def latitude_rad(self) -> float:
+        """Geodetic latitude, rad, north positive."""
+        return self.latitude_deg * DEG
+
+    @property
+    def longitude_rad(self) -> float:
+        """Longitude, rad, east positive."""
+        return self.longitude_deg * DEG

@@ -1,0 +1,30 @@
+"""Constants of nature and of units, each with its unit; SI and radians everywhere else.
+
+Multiply by a constant to come in (``30.0 * ARCSEC`` is in rad), divide to go out.
+"""
+
+from math import pi
+from typing import Final
+
+DEG: Final = pi / 180.0
+"""One degree, rad."""
+ARCSEC: Final = DEG / 3600.0
+"""One second of arc, rad."""
+DEG_PER_H: Final = DEG / 3600.0
+"""One degree per hour, rad/s."""
+DEG_PER_SQRT_H: Final = DEG / 60.0
+"""One degree per square root of an hour (angle random walk), rad/sqrt(s)."""
+STANDARD_GRAVITY: Final = 9.80665
+"""Standard gravity, m/s^2 (3rd CGPM, 1901)."""
+UG: Final = 1e-6 * STANDARD_GRAVITY
+"""One micro-g, m/s^2."""
+MM: Final = 1e-3
+"""One millimetre, m."""
+URAD: Final = 1e-6
+"""One microradian, rad."""
+PPM: Final = 1e-6
+"""One part per million."""
+NS: Final = 1e-9
+"""One nanosecond, s."""
+NS_PER_S: Final = 1_000_000_000
+"""Nanoseconds in a second."""

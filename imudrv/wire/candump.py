@@ -1,0 +1,284 @@
+"""Text of a candump log to CAN messages and back, a line a message.
+
+    (1700000000.123456) can0 150#0001FFFF02004000            classic, id of 3 or 8 hex digits
+    (1700000000.123456) can0 158##1000102...                 CAN FD: ``##`` and one digit of flags
+
+A record holds the number of an identifier, not whether it was sent with 11 or 29 bits.
+"""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imudrv.errors import InputError
+from imudrv.kernels import kernel
+from imudrv.records import MESSAGE, REJECT, Reason, Records
+from imudrv.units import NS_PER_S
+
+LONGEST_LINE: Final = 256
+"""Characters of a line, its end not counted; a longer one is no message."""
+
+_NEWLINE, _TAB, _RETURN, _SPACE = ord("\n"), ord("\t"), ord("\r"), ord(" ")
+_OPEN, _CLOSE, _POINT, _HASH, _ZERO = ord("("), ord(")"), ord("."), ord("#"), ord("0")
+_RECEIVED, _TRANSMITTED = ord("R"), ord("T")
+_NOT_HEX: Final = 255
+_LAST_SECOND: Final = (2**63 - 1) // NS_PER_S - 1
+_NOT_A_MESSAGE: Final = int(Reason.NOT_A_MESSAGE)
+
+_NIBBLES = np.full(256, _NOT_HEX, np.uint8)
+for _value, _digit in enumerate(b"0123456789ABCDEF"):
+    _NIBBLES[_digit] = _NIBBLES[ord(chr(_digit).lower())] = _value
+_DIGITS = np.frombuffer(b"0123456789ABCDEF", np.uint8).copy()
+
+
+class CandumpDecoder:
+    """Decoder of candump log text; feed it as it comes, in any pieces.
+
+    The messages and rejects are the same for any cut of the text into pieces, and every byte fed is in the
+    line of a message, in a blank line, in a reject (its line, whole) or among the `pending` ones. Remote
+    frames carry no data and are rejects. The channel is not looked at: a log of several is for its reader to
+    sort.
+    """
+
+    def __init__(self) -> None:
+        self._line: NDArray[np.uint8] = np.zeros(0, np.uint8)
+        self._cut = 0
+        self._offset = 0
+
+    @property
+    def pending(self) -> int:
+        """Bytes of the last line, whose end has not come; at most `LONGEST_LINE` + 1 of them are kept."""
+        return self._line.size + self._cut
+
+    @property
+    def bytes_fed(self) -> int:
+        """Bytes fed since the beginning."""
+        return self._offset + self.pending
+
+    def feed(self, data: bytes | bytearray | memoryview | NDArray[np.uint8]) -> tuple[Records, Records]:
+        """Take text in.
+
+        Parameters
+        ----------
+        data : bytes-like
+            Any number of bytes.
+
+        Returns
+        -------
+        messages : ndarray of MESSAGE
+            With the log's own times.
+        rejects : ndarray of REJECT
+            Lines that are no message.
+        """
+        text = np.concatenate([self._line, np.frombuffer(data, np.uint8)])
+        ends = np.flatnonzero(text == _NEWLINE)
+        messages = np.zeros(ends.size, MESSAGE)
+        rejects = np.zeros(ends.size, REJECT)
+        found, rejected = _scan(text, ends, messages, rejects)
+        rejects = rejects[:rejected]
+        rejects["offset"] += self._offset
+        if ends.size and self._cut:
+            # What was cut off belongs to the first line; what was kept of that is too long, hence its reject.
+            rejects["length"][0] += self._cut
+            rejects["offset"][1:] += self._cut
+            self._offset += self._cut
+            self._cut = 0
+        stop = int(ends[-1]) + 1 if ends.size else 0
+        self._offset += stop
+        rest = text[stop:]
+        self._line = rest[: LONGEST_LINE + 1].copy()
+        self._cut += rest.size - self._line.size
+        return messages[:found], rejects
+
+    def close(self) -> tuple[Records, Records]:
+        """End of the log: a last line without an end is taken as it is.
+
+        Returns
+        -------
+        messages, rejects
+            As from `feed`; at the most one of both together.
+        """
+        messages, rejects = self.feed(b"\n")
+        self._offset -= 1
+        rejects["length"] -= 1
+        rejects["reason"] = Reason.UNFINISHED
+        return messages, rejects
+
+
+@kernel
+def _scan(text, ends, messages, rejects):  # type: ignore[no-untyped-def]
+    """Read every whole line; `ends` has where their newlines stand."""
+    start = found = rejected = 0
+    for i in range(ends.shape[0]):
+        end = ends[np.uint64(i)]
+        message = messages[found]
+        if end - start <= LONGEST_LINE and _parse(text, start, message):
+            found += 1
+        else:
+            message.data[:] = 0
+            if text[_skip_blanks(text, start)] != _NEWLINE or end - start > LONGEST_LINE:
+                rejects[rejected].offset = start
+                rejects[rejected].length = end + 1 - start
+                rejects[rejected].reason = _NOT_A_MESSAGE
+                rejected += 1
+        start = end + 1
+    return found, rejected
+
+
+@kernel
+def _parse(text, p, message):  # type: ignore[no-untyped-def]
+    """Read the line at `p` into `message`, whose data are zeros; no step goes past the line's newline."""
+    if text[p] != _OPEN:
+        return False
+    p, seconds, digits = _decimal(text, p + 1)
+    if digits < 1 or digits > 10 or seconds > _LAST_SECOND or text[p] != _POINT:
+        return False
+    p, fraction, digits = _decimal(text, p + 1)
+    if digits < 1 or digits > 9 or text[p] != _CLOSE:
+        return False
+    for _ in range(9 - digits):
+        fraction *= 10
+    message.t_ns = seconds * NS_PER_S + fraction
+    channel = _skip_blanks(text, p + 1)
+    if channel == p + 1:
+        return False
+    p = channel
+    while text[p] > _SPACE:
+        p += 1
+    begin = _skip_blanks(text, p)
+    if p == channel or begin == p:
+        return False
+
+    p = begin
+    identifier = np.int64(0)
+    while p < begin + 8 and _NIBBLES[text[p]] != _NOT_HEX:
+        identifier = identifier << 4 | np.int64(_NIBBLES[text[p]])
+        p += 1
+    limit = 0x7FF if p - begin == 3 else 0x1FFFFFFF
+    if (p - begin != 3 and p - begin != 8) or identifier > limit or text[p] != _HASH:
+        return False
+    message.id = identifier
+    p += 1
+    longest = 8
+    message.fd = 0
+    if text[p] == _HASH:
+        if _NIBBLES[text[p + 1]] == _NOT_HEX:
+            return False
+        message.fd = 1
+        longest = 64
+        p += 2
+
+    length = 0
+    while length < longest:
+        high = _NIBBLES[text[p]]
+        if high == _NOT_HEX:
+            break
+        low = _NIBBLES[text[p + 1]]
+        if low == _NOT_HEX:
+            return False
+        message.data[np.uint64(length)] = high << 4 | low
+        length += 1
+        p += 2
+    message.length = length
+    end = _skip_blanks(text, p)
+    if end > p and (text[end] == _RECEIVED or text[end] == _TRANSMITTED):
+        end = _skip_blanks(text, end + 1)
+    return text[end] == _NEWLINE
+
+
+@kernel
+def _decimal(text, p):  # type: ignore[no-untyped-def]
+    """Where the digits at `p` end, their value (right for up to 18 of them) and how many they are."""
+    begin = p
+    value = np.int64(0)
+    while _ZERO <= text[p] <= _ZERO + 9:
+        value = value * 10 + np.int64(text[p] - _ZERO)
+        p += 1
+    return p, value, p - begin
+
+
+@kernel
+def _skip_blanks(text, p):  # type: ignore[no-untyped-def]
+    """Where the spaces, tabs and carriage returns at `p` end."""
+    while text[p] == _SPACE or text[p] == _TAB or text[p] == _RETURN:
+        p += 1
+    return p
+
+
+def format_candump(messages: Records, channel: str = "can0") -> bytes:
+    """Write messages as candump log text; the time is cut to whole microseconds.
+
+    Parameters
+    ----------
+    messages : ndarray of MESSAGE, shape (n,)
+        What to write.
+    channel : str
+        Name of the interface.
+
+    Returns
+    -------
+    bytes
+        One line a message: ``(seconds.micro) channel ID#DATA``, for CAN FD ``ID##1DATA``.
+
+    Raises
+    ------
+    InputError
+        A time before 1970, or a channel's name that no log can hold.
+    """
+    name = np.frombuffer(channel.encode(), np.uint8)
+    if not 1 <= name.size <= 16 or not np.all((name > _SPACE) & (name < 127)):
+        raise InputError(f"channel: expected 1 to 16 printable characters without blanks, got {channel!r}")
+    if messages.size == 0:
+        return b""
+    if messages["t_ns"].min() < 0:
+        raise InputError(
+            f"message {int(messages['t_ns'].argmin())}: expected a time from 1970 on, "
+            f"got {int(messages['t_ns'].min())} ns; a candump log cannot tell it"
+        )
+    around_data = len("(1700000000.123456)  12345678##1\n") + name.size
+    text = np.empty(messages.size * (around_data + 2 * int(messages["length"].max())), np.uint8)
+    return text[: _write(messages, name, text)].tobytes()
+
+
+@kernel
+def _write(messages, name, text):  # type: ignore[no-untyped-def]
+    """Write the lines of all messages to `text`; how many bytes they took."""
+    p = 0
+    for i in range(messages.shape[0]):
+        message = messages[np.uint64(i)]
+        text[p] = _OPEN
+        microseconds = message.t_ns // 1000
+        for k in range(16, 10, -1):
+            text[p + 1 + k] = _ZERO + microseconds % 10
+            microseconds //= 10
+        text[p + 11] = _POINT
+        for k in range(9, -1, -1):
+            text[p + 1 + k] = _ZERO + microseconds % 10
+            microseconds //= 10
+        text[p + 18] = _CLOSE
+        text[p + 19] = _SPACE
+        p += 20
+        for k in range(name.shape[0]):
+            text[p] = name[k]
+            p += 1
+        text[p] = _SPACE
+        p += 1
+        digits = 3 if message.id <= 0x7FF else 8
+        for k in range(digits):
+            text[p + k] = _DIGITS[message.id >> np.uint32(4 * (digits - 1 - k)) & np.uint32(15)]
+        p += digits
+        text[p] = _HASH
+        p += 1
+        if message.fd:
+            text[p] = _HASH
+            text[p + 1] = _ZERO + 1
+            p += 2
+        for k in range(message.length):
+            byte = message.data[np.uint64(k)]
+            text[p] = _DIGITS[byte >> 4]
+            text[p + 1] = _DIGITS[byte & 15]
+            p += 2
+        text[p] = _NEWLINE
+        p += 1
+    return p

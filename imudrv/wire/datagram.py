@@ -1,0 +1,137 @@
+"""The output datagram `I50N`, version 1: 76 bytes a sample, several back to back in one packet (ICD, section 7)."""
+
+import zlib
+from enum import IntEnum
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imudrv.records import INCREMENTS, Records
+from imudrv.wire.layout import Check, CheckKind, Layout, Message
+from imudrv.wire.stream import StreamDecoder
+
+MAGIC: Final = b"I50N"
+VERSION: Final = 1
+
+DATAGRAM: Final = np.dtype(
+    [
+        ("magic", "S4"),
+        ("version", "u1"),
+        ("source", "u1"),
+        ("flags", "<u2"),
+        ("counter", "<u4"),
+        ("interval_ns", "<u4"),
+        ("t_ns", "<i8"),
+        ("dtheta_b", "<f8", 3),
+        ("dv_b", "<f8", 3),
+        ("crc", "<u4"),
+    ]
+)
+SIZE: Final = DATAGRAM.itemsize
+_CHECKED: Final = SIZE - 4
+_SAME: Final = ("flags", "counter", "interval_ns", "t_ns", "dtheta_b", "dv_b")
+
+
+class Source(IntEnum):
+    """Where the samples come from."""
+
+    HARDWARE = 0
+    REPLAY = 1
+    SIMULATOR = 2
+
+
+def encode(increments: Records, source: Source) -> bytes:
+    """Datagrams of compensated increments.
+
+    Parameters
+    ----------
+    increments : ndarray of INCREMENTS
+        In order; the counter goes out modulo 2^32.
+    source : Source
+        Where they come from.
+
+    Returns
+    -------
+    bytes
+        76 a sample, back to back.
+    """
+    rows = np.zeros(len(increments), DATAGRAM)
+    rows["magic"] = MAGIC
+    rows["version"] = VERSION
+    rows["source"] = source
+    for name in _SAME:
+        rows[name] = increments[name]
+    data = memoryview(rows.view(np.uint8))
+    rows["crc"] = [zlib.crc32(data[at : at + _CHECKED]) for at in range(0, len(data), SIZE)]
+    return rows.tobytes()
+
+
+class Received(NamedTuple):
+    """What a `DatagramDecoder` found.
+
+    Parameters
+    ----------
+    increments : ndarray of INCREMENTS
+        In the order of arrival.
+    source : ndarray of uint8
+        `Source` of each.
+    rejects : ndarray of REJECT
+        Stretches that are no datagram.
+    """
+
+    increments: Records
+    source: NDArray[np.uint8]
+    rejects: Records
+
+
+_LAYOUT: Final = Layout(
+    name="I50N",
+    can=False,
+    fd=False,
+    big_endian=False,
+    interval_ns=1_000_000,
+    totals=False,
+    counter_bits=32,
+    pulse_bits=32,
+    messages=(
+        Message(
+            SIZE,
+            (),
+            (*enumerate(MAGIC), (4, VERSION)),
+            Check(CheckKind.CRC_REFLECTED, 32, 0, _CHECKED, _CHECKED, 0x04C11DB7, 0xFFFFFFFF, 0xFFFFFFFF),
+        ),
+    ),
+)
+
+
+class DatagramDecoder:
+    """Datagrams back to increments, from packets, a TCP stream or a serial line, in any pieces."""
+
+    def __init__(self) -> None:
+        self._finder = StreamDecoder(_LAYOUT)
+        self._tail = np.zeros(0, np.uint8)
+
+    def feed(self, data: bytes | bytearray | memoryview) -> Received:
+        """Take bytes in.
+
+        Parameters
+        ----------
+        data : bytes-like
+            Any number of bytes.
+
+        Returns
+        -------
+        Received
+            What became complete with them.
+        """
+        begin = self._finder.bytes_fed - self._finder.pending
+        buffer = np.concatenate([self._tail, np.frombuffer(data, np.uint8)])
+        found = self._finder.feed(data)
+        self._tail = buffer[buffer.size - self._finder.pending :]
+        places = (found.frames["offset"] - begin)[:, None] + np.arange(SIZE)
+        rows = buffer[places].view(DATAGRAM)[:, 0] if len(places) else np.zeros(0, DATAGRAM)
+        increments = np.zeros(len(rows), INCREMENTS)
+        for name in _SAME:
+            increments[name] = rows[name]
+        return Received(increments, rows["source"], found.rejects)

@@ -1,0 +1,190 @@
+"""Pulses to the bytes of a stream or to CAN messages: the simulator's and the tests' direction."""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from imudrv.errors import InputError
+from imudrv.kernels import kernel
+from imudrv.records import MAX_TEMPERATURES, MESSAGE, Records
+from imudrv.wire.check import KIND, OFFSET, WIDTH, compute
+from imudrv.wire.layout import ACCELEROMETER, COUNTER, GYRO, STATUS, TEMPERATURE, Field, Layout, Message
+
+_TARGETS: Final = TEMPERATURE + MAX_TEMPERATURES
+_PULSES: Final = slice(GYRO, STATUS)
+_NAMES: Final = (
+    "counter",
+    *(f"{sensor} {axis}" for sensor in ("gyro", "accelerometer") for axis in "xyz"),
+    "status",
+)
+
+
+class _Encoder:
+    """What both encoders share: the numbers of every field, checked, and the running totals.
+
+    Parameters
+    ----------
+    layout : Layout
+        What is encoded.
+    totals : array_like of int, shape (6,)
+        Running totals before the first sample, gyro and accelerometer X Y Z; for profiles with totals.
+    """
+
+    def __init__(self, layout: Layout, totals: ArrayLike = (0, 0, 0, 0, 0, 0)) -> None:
+        self._layout = layout
+        self._totals = np.array(totals, np.int64)
+
+    def _numbers(self, pulses: Records) -> NDArray[np.int64]:
+        """Give the number of each target, shape (n, `_TARGETS`), one column a target."""
+        numbers = np.zeros((pulses.size, _TARGETS), np.int64)
+        numbers[:, COUNTER] = pulses["counter"]
+        numbers[:, GYRO:ACCELEROMETER] = pulses["gyro"]
+        numbers[:, ACCELEROMETER:STATUS] = pulses["accelerometer"]
+        numbers[:, STATUS] = pulses["status"]
+        for message in self._layout.messages:
+            for field in message.fields:
+                if field.target >= TEMPERATURE:
+                    self._put_temperature(numbers, pulses, field)
+                elif field.target != COUNTER:
+                    self._require_room(numbers, field)
+        if self._layout.totals and pulses.size:
+            numbers[:, _PULSES] = self._totals + np.cumsum(numbers[:, _PULSES], axis=0)
+            self._totals = numbers[-1, _PULSES].copy()
+        return numbers
+
+    def _put_temperature(self, numbers: NDArray[np.int64], pulses: Records, field: Field) -> None:
+        channel = field.target - TEMPERATURE
+        degc = pulses["temperature_degc"][:, channel]
+        counts = (degc - self._layout.degc_at_zero[channel]) / self._layout.degc_per_count[channel]
+        lowest, highest = _limits(field.bits, field.signed)
+        numbers[:, field.target] = np.rint(np.clip(np.nan_to_num(counts), lowest, highest))
+
+    def _require_room(self, numbers: NDArray[np.int64], field: Field) -> None:
+        column = numbers[:, field.target]
+        # A total of n bits tells increments apart like a signed number of n bits.
+        is_total = self._layout.totals and field.target != STATUS
+        lowest, highest = _limits(field.bits, field.signed or is_total)
+        outside = (column < lowest) | (column > highest)
+        if outside.any():
+            first = int(outside.argmax())
+            raise InputError(
+                f"sample {int(numbers[first, COUNTER])}, {_NAMES[field.target]}: "
+                f"expected {lowest} to {highest}, the {field.bits} bits of profile {self._layout.name}, "
+                f"got {int(column[first])}; "
+                "take a profile with wider fields, or calmer motion"
+            )
+
+
+class StreamEncoder(_Encoder):
+    """Encoder of a stream profile; the running totals go on from call to call.
+
+    Parameters
+    ----------
+    layout : Layout
+        Of a stream profile.
+    totals : array_like of int, shape (6,)
+        Running totals before the first sample, gyro and accelerometer X Y Z; for profiles with totals.
+    """
+
+    def encode(self, pulses: Records) -> NDArray[np.uint8]:
+        """Write samples.
+
+        Parameters
+        ----------
+        pulses : ndarray of PULSES, shape (n,)
+            Each of one interval. Counters go out modulo the width of their field; temperatures are rounded
+            and clipped to theirs, NaN becomes 0 counts.
+
+        Returns
+        -------
+        ndarray, shape (n, length)
+            One frame a row.
+
+        Raises
+        ------
+        InputError
+            A number that its field cannot hold.
+        """
+        (message,) = self._layout.messages
+        return _encode(self._numbers(pulses), self._layout, message)
+
+
+class CanEncoder(_Encoder):
+    """Encoder of a CAN profile; the running totals go on from call to call.
+
+    Parameters
+    ----------
+    layout : Layout
+        Of a CAN profile.
+    totals : array_like of int, shape (6,)
+        Running totals before the first sample, gyro and accelerometer X Y Z; for profiles with totals.
+    """
+
+    def encode(self, pulses: Records) -> Records:
+        """Write samples.
+
+        Parameters
+        ----------
+        pulses : ndarray of PULSES, shape (n,)
+            As for `StreamEncoder.encode`; `arrival_ns` becomes the messages' time.
+
+        Returns
+        -------
+        ndarray of MESSAGE
+            Sample by sample, in the profile's order. A message with `every` = k goes with the samples whose
+            counter is a multiple of k.
+
+        Raises
+        ------
+        InputError
+            A number that its field cannot hold.
+        """
+        numbers = self._numbers(pulses)
+        kinds = self._layout.messages
+        every = np.array([kind.every for kind in kinds])
+        is_sent = pulses["counter"][:, np.newaxis] % every == 0
+        place = np.cumsum(is_sent).reshape(is_sent.shape) - 1
+        messages = np.zeros(np.count_nonzero(is_sent), MESSAGE)
+        messages["fd"] = self._layout.fd
+        for k, kind in enumerate(kinds):
+            at = place[is_sent[:, k], k]
+            messages["t_ns"][at] = pulses["arrival_ns"][is_sent[:, k]]
+            messages["id"][at] = kind.can_id
+            messages["length"][at] = kind.length
+            messages["data"][at, : kind.length] = _encode(numbers[is_sent[:, k]], self._layout, kind)
+        return messages
+
+
+def _limits(bits: int, signed: bool) -> tuple[int, int]:
+    return (-(1 << (bits - 1)), (1 << (bits - 1)) - 1) if signed else (0, (1 << bits) - 1)
+
+
+def _encode(numbers: NDArray[np.int64], layout: Layout, message: Message) -> NDArray[np.uint8]:
+    rows = np.zeros((len(numbers), message.length), np.uint8)
+    for offset, value in message.constants:
+        rows[:, offset] = value
+    _fill_rows(rows, numbers, layout.tables(message))
+    return rows
+
+
+@kernel
+def _fill_rows(rows, numbers, tables):  # type: ignore[no-untyped-def]
+    """Write the fields and the check of one kind of message, one message a row."""
+    # Out of the tuple once: each access inside the loop would count references.
+    _, big_endian, _, fields, check, crc_table = tables
+    for i in range(rows.shape[0]):
+        row = rows[np.uint64(i)]
+        for f in range(fields.shape[0]):
+            field = fields[np.uint64(f)]
+            _write(row, field[1], field[2], big_endian, numbers[np.uint64(i), np.uint64(field[0])])
+        if check[KIND] != 0:
+            _write(row, check[OFFSET], check[WIDTH], big_endian, compute(row, 0, check, crc_table))
+
+
+@kernel
+def _write(row, p, bits, big_endian, value):  # type: ignore[no-untyped-def]
+    """Put the low `bits` (8, 16, 24, 32) of `value` at `p`."""
+    for shift in range(0, bits, 8):
+        at = p + (bits - 8 - shift if big_endian else shift) // 8
+        row[np.uint64(at)] = value >> shift & 0xFF

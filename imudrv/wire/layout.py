@@ -1,0 +1,196 @@
+"""How the messages of one profile look: the form of a profile that the kernels read."""
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+COUNTER: Final = 0
+GYRO: Final = 1
+ACCELEROMETER: Final = 4
+STATUS: Final = 7
+TEMPERATURE: Final = 8
+"""Targets of a field: the counter, three gyro and three accelerometer axes, the status, then temperatures."""
+
+
+class CheckKind(IntEnum):
+    """How a message is protected."""
+
+    NONE = 0
+    SUM = 1
+    CRC = 2
+    CRC_REFLECTED = 3
+
+
+class Field(NamedTuple):
+    """One number in a message.
+
+    Parameters
+    ----------
+    target : int
+        What it is: `COUNTER`, `GYRO` + axis, `ACCELEROMETER` + axis, `STATUS` or `TEMPERATURE` + channel.
+    offset : int
+        Of its first byte.
+    bits : int
+        8, 16, 24 or 32.
+    signed : bool
+        Two's complement.
+    """
+
+    target: int
+    offset: int
+    bits: int
+    signed: bool
+
+
+class Check(NamedTuple):
+    """The check of a message.
+
+    Parameters
+    ----------
+    kind : CheckKind
+        What is computed.
+    width : int
+        Bits of the result: 8, 16 or 32.
+    start, stop : int
+        The bytes it covers, `stop` excluded.
+    offset : int
+        Where it stands.
+    polynomial, init, xor_out : int
+        The CRC's parameters in the notation of R. N. Williams, "A painless guide to CRC error detection
+        algorithms" (1993); unreflected.
+    prefix : bytes
+        Bytes that are not in the message but are covered first.
+    """
+
+    kind: CheckKind = CheckKind.NONE
+    width: int = 8
+    start: int = 0
+    stop: int = 0
+    offset: int = 0
+    polynomial: int = 0
+    init: int = 0
+    xor_out: int = 0
+    prefix: bytes = b""
+
+
+class Message(NamedTuple):
+    """One kind of message: a stream has one, a CAN profile one or more.
+
+    Parameters
+    ----------
+    length : int
+        Bytes of the whole message.
+    fields : tuple of Field
+        Its numbers.
+    constants : tuple of (int, int)
+        Offset and value of the bytes that never change (sync, id, length), in the order to test them.
+    check : Check
+        Its protection.
+    can_id : int
+        CAN identifier; 0 in a stream.
+    every : int
+        It is sent with each `every`-th sample; a sample exists when all messages with 1 have arrived.
+    """
+
+    length: int
+    fields: tuple[Field, ...]
+    constants: tuple[tuple[int, int], ...] = ()
+    check: Check = Check()
+    can_id: int = 0
+    every: int = 1
+
+    def has(self, target: int) -> bool:
+        """Whether a field of this message fills `target`."""
+        return any(field.target == target for field in self.fields)
+
+
+class Tables(NamedTuple):
+    """One message as arrays, for the kernels; see `imudrv.wire.fields` and `imudrv.wire.check`."""
+
+    length: int
+    big_endian: bool
+    constants: NDArray[np.int64]
+    fields: NDArray[np.int64]
+    check: NDArray[np.int64]
+    crc_table: NDArray[np.uint32]
+
+
+class StatusMasks(NamedTuple):
+    """Which bits of the status word mean what for the driver."""
+
+    fault: int = 0
+    saturated: int = 0
+    warm_up: int = 0
+
+
+@dataclass(frozen=True)
+class Layout:
+    """All that decoding needs to know of a profile.
+
+    Parameters
+    ----------
+    name : str
+        Of the profile.
+    can : bool
+        CAN messages; otherwise a byte stream of one kind of message.
+    fd : bool
+        The CAN messages are CAN FD.
+    big_endian : bool
+        Byte order of every number.
+    interval_ns : int
+        Sample interval.
+    totals : bool
+        The pulses are running totals; otherwise increments.
+    counter_bits, pulse_bits : int
+        Widths of the full counter and of the narrowest pulse field.
+    messages : tuple of Message
+        What is sent.
+    temperature_names : tuple of str
+        What each temperature channel measures.
+    degc_per_count, degc_at_zero : tuple of float
+        Scale and origin of each temperature channel.
+    status : StatusMasks
+        Meaning of the status word.
+    status_names : tuple of (int, str)
+        Bit and name, for people.
+    """
+
+    name: str
+    can: bool
+    fd: bool
+    big_endian: bool
+    interval_ns: int
+    totals: bool
+    counter_bits: int
+    pulse_bits: int
+    messages: tuple[Message, ...]
+    temperature_names: tuple[str, ...] = ()
+    degc_per_count: tuple[float, ...] = ()
+    degc_at_zero: tuple[float, ...] = ()
+    status: StatusMasks = StatusMasks()
+    status_names: tuple[tuple[int, str], ...] = ()
+
+    @property
+    def pulse_limit(self) -> int:
+        """Largest pulse increment of one interval that the wire can carry."""
+        return (1 << (self.pulse_bits - 1)) - 1
+
+    def tables(self, message: Message) -> Tables:
+        """The arrays that the kernels read of `message`."""
+        from imudrv.wire.check import crc_table, start_value
+
+        check = message.check
+        return Tables(
+            message.length,
+            self.big_endian,
+            np.array(message.constants, np.int64).reshape(-1, 2),
+            np.array(message.fields, np.int64).reshape(-1, 4),
+            np.array(
+                [check.kind, check.width, check.start, check.stop, check.offset, start_value(check), check.xor_out],
+                np.int64,
+            ),
+            crc_table(check),
+        )

@@ -1,0 +1,260 @@
+"""Counter and loss accounting: every number that the unit sent is in exactly one place, always."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from imudrv.imu.accounting import MAX_INTERVAL_NS, WINDOW, Account, Accountant
+from imudrv.profiles import load
+from imudrv.records import FRAME, NO_TEMPERATURE, Flag, Records
+from imudrv.wire.layout import Layout
+
+INCREMENTS = load("imu50-rs422").layout()
+TOTALS = load("imu50-rs422-acc").layout()
+TAU = 1_000_000
+
+
+def frames(counters: Sequence[int], **columns: object) -> Records:
+    rows = np.zeros(len(counters), FRAME)
+    rows["counter"] = counters
+    rows["t_ns"] = 7_000 + np.arange(len(counters))
+    for name, values in columns.items():
+        rows[name] = values
+    return rows
+
+
+def run(counters: Sequence[int], layout: Layout = INCREMENTS, **columns: object) -> tuple[Records, Account]:
+    accountant = Accountant(layout)
+    pulses = accountant.feed(frames(counters, **columns))
+    assert accountant.account.closes
+    return pulses, accountant.account
+
+
+def books(account: Account) -> dict[str, int]:
+    """The buckets that are not empty, without those that every run has."""
+    names = ("base", "duplicate", "late", "damaged", "torn", "missing", "restarts", "bridged")
+    return {name: getattr(account, name) for name in names if getattr(account, name)}
+
+
+def totals(increments: list[list[int]]) -> np.ndarray:
+    """Running totals as the wire has them."""
+    return np.cumsum(increments, axis=0) % 2**16
+
+
+def test_an_unbroken_run_is_handed_on_whole():
+    pulses, account = run([5, 6, 7], gyro=[[1, 2, 3]] * 3, accelerometer=[[4, 5, 6]] * 3)
+    assert books(account) == {}
+    assert (account.frames, account.good, account.expected, account.lost) == (3, 3, 3, 0)
+    assert pulses["counter"].tolist() == [5, 6, 7]
+    assert pulses["gyro"].tolist() == [[1, 2, 3]] * 3
+    assert pulses["accelerometer"].tolist() == [[4, 5, 6]] * 3
+    assert pulses["elapsed_ns"].tolist() == [TAU, 2 * TAU, 3 * TAU]
+    assert pulses["interval_ns"].tolist() == [TAU] * 3
+    assert pulses["arrival_ns"].tolist() == [7000, 7001, 7002]
+    assert pulses["flags"].tolist() == [Flag.VALID] * 3
+
+
+@pytest.mark.parametrize("bits", [8, 16, 32])
+def test_the_counter_goes_across_its_wrap(bits):
+    layout = replace(INCREMENTS, counter_bits=bits)
+    top = 2**bits
+    pulses, account = run([top - 2, top - 1, 0, 1], layout)
+    assert books(account) == {}
+    assert pulses["counter"].tolist() == [top - 2, top - 1, top, top + 1]
+
+
+@pytest.mark.parametrize("bits", [8, 16, 32])
+def test_losses_across_the_wrap_are_counted(bits):
+    layout = replace(INCREMENTS, counter_bits=bits)
+    pulses, account = run([2**bits - 1, 5], layout)
+    assert books(account) == {"missing": 5}
+    assert pulses["elapsed_ns"].tolist() == [TAU, 7 * TAU]
+
+
+def test_a_counter_of_8_bits_goes_around_many_times():
+    layout = replace(INCREMENTS, counter_bits=8)
+    pulses, account = run([i % 256 for i in range(1000)], layout)
+    assert books(account) == {}
+    assert pulses["counter"].tolist() == list(range(1000))
+
+
+def test_what_did_not_come_is_missing_and_the_next_sample_says_so():
+    pulses, account = run([1, 2, 6, 7])
+    assert books(account) == {"missing": 3}
+    assert (account.expected, account.good, account.lost) == (7, 4, 3)
+    assert ((pulses["flags"] & Flag.MISSING_BEFORE) != 0).tolist() == [False, False, True, False]
+    assert pulses["interval_ns"].tolist() == [TAU] * 4
+    assert pulses["elapsed_ns"].tolist() == [TAU, 2 * TAU, 6 * TAU, 7 * TAU]
+
+
+def test_rejected_bytes_and_torn_pairs_explain_losses_but_never_more_than_there_are():
+    _, account = run([1, 6], damaged=[0, 2], torn=[0, 1])
+    assert books(account) == {"torn": 1, "damaged": 2, "missing": 1}
+    _, account = run([1, 3], damaged=[0, 9], torn=[0, 9])
+    assert books(account) == {"torn": 1}
+    _, account = run([1, 2], damaged=[0, 9], torn=[0, 9])
+    assert books(account) == {}
+
+
+def test_a_frame_that_comes_after_a_later_one_is_late_and_no_longer_missing():
+    pulses, account = run([1, 2, 5, 4, 6])
+    assert books(account) == {"late": 1, "missing": 1}
+    assert pulses["counter"].tolist() == [1, 2, 5, 6]
+
+
+def test_a_frame_that_comes_twice_is_a_duplicate():
+    pulses, account = run([1, 2, 2, 1, 3, 2])
+    assert books(account) == {"duplicate": 3}
+    assert pulses["counter"].tolist() == [1, 2, 3]
+
+
+def test_a_late_frame_that_comes_twice_is_late_once():
+    _, account = run([1, 5, 3, 3])
+    assert books(account) == {"late": 1, "duplicate": 1, "missing": 2}
+
+
+def test_a_late_frame_from_before_the_first_widens_what_was_expected():
+    pulses, account = run([10, 7, 8, 11])
+    assert books(account) == {"late": 2, "missing": 1}
+    assert account.expected == 5
+    assert pulses["counter"].tolist() == [10, 11]
+
+
+def test_a_late_frame_takes_back_what_was_called_damaged_or_torn():
+    _, account = run([1, 3, 2], damaged=[0, 1, 0])
+    assert books(account) == {"late": 1}
+    _, account = run([1, 3, 2], torn=[0, 1, 0])
+    assert books(account) == {"late": 1}
+
+
+def test_the_window_separates_late_from_a_restart():
+    _, account = run([1000, 1000 - WINDOW + 1])
+    assert books(account) == {"late": 1, "missing": WINDOW - 2}
+    pulses, account = run([1000, 1000 - WINDOW, 1000 - WINDOW + 1])
+    assert books(account) == {"restarts": 1}
+    assert pulses["counter"].tolist() == [1000, 936, 937]
+
+
+def test_after_a_restart_time_goes_on_and_the_break_is_flagged():
+    pulses, account = run([1000, 1001, 0, 1])
+    assert books(account) == {"restarts": 1}
+    assert account.expected == 4
+    assert np.all(np.diff(pulses["elapsed_ns"]) == TAU)
+    assert ((pulses["flags"] & Flag.MISSING_BEFORE) != 0).tolist() == [False, False, True, False]
+
+
+def test_totals_begin_with_a_base_and_give_differences_across_their_wrap():
+    increments = [[65530, 0, 0], [10, -3, 7], [-20, 5, -7], [32767, -32768, 0]]
+    pulses, account = run([0, 1, 2, 3], TOTALS, gyro=totals(increments), accelerometer=totals(increments))
+    assert books(account) == {"base": 1}
+    assert pulses["gyro"].tolist() == increments[1:]
+    assert pulses["accelerometer"].tolist() == increments[1:]
+    assert pulses["flags"].tolist() == [Flag.VALID] * 3
+    assert pulses["elapsed_ns"].tolist() == [2 * TAU, 3 * TAU, 4 * TAU]
+
+
+def test_totals_bridge_a_gap_with_one_long_interval_that_holds_all_pulses():
+    increments = [[9, 9, 9], [100, -50, 3], [101, -51, 4], [102, -52, 5], [103, -53, 6]]
+    sent = totals(increments)
+    pulses, account = run([0, 1, 4], TOTALS, gyro=sent[[0, 1, 4]], accelerometer=sent[[0, 1, 4]])
+    assert books(account) == {"base": 1, "missing": 2, "bridged": 2}
+    assert pulses["gyro"].tolist() == [[100, -50, 3], [306, -156, 15]]
+    assert pulses["gyro"].sum(axis=0).tolist() == np.sum(increments[1:], axis=0).tolist()
+    assert pulses["interval_ns"].tolist() == [TAU, 3 * TAU]
+    assert pulses["flags"].tolist() == [Flag.VALID, Flag.VALID | Flag.LONG_INTERVAL]
+
+
+def test_a_gap_in_totals_longer_than_a_datagram_can_tell_begins_anew():
+    longest = MAX_INTERVAL_NS // TAU
+    pulses, account = run([0, longest], TOTALS)
+    assert books(account) == {"base": 1, "missing": longest - 1, "bridged": longest - 1}
+    assert pulses["interval_ns"].tolist() == [longest * TAU]
+
+    pulses, account = run([0, longest + 1, longest + 2], TOTALS)
+    assert books(account) == {"base": 2, "missing": longest}
+    assert pulses["interval_ns"].tolist() == [TAU]
+    assert pulses["flags"].tolist() == [Flag.VALID | Flag.MISSING_BEFORE]
+    assert pulses["elapsed_ns"].tolist() == [(longest + 3) * TAU]
+
+
+def test_totals_begin_anew_after_a_restart_and_the_break_is_flagged_even_across_a_bridge():
+    pulses, account = run([1000, 1001, 0, 1], TOTALS, gyro=[[5] * 3, [6] * 3, [0] * 3, [2] * 3])
+    assert books(account) == {"base": 2, "restarts": 1}
+    assert pulses["gyro"].tolist() == [[1] * 3, [2] * 3]
+    assert pulses["flags"].tolist() == [Flag.VALID, Flag.VALID | Flag.MISSING_BEFORE]
+
+    pulses, account = run([1000, 1001, 0, 3], TOTALS)
+    assert books(account) == {"base": 2, "restarts": 1, "missing": 2, "bridged": 2}
+    assert pulses["flags"][1] == Flag.VALID | Flag.LONG_INTERVAL | Flag.MISSING_BEFORE
+
+
+def test_a_gap_so_long_that_the_totals_may_have_gone_round_is_not_valid():
+    # 10 000 pulses a millisecond before a gap of four: the difference of 16 bits is not sure any more.
+    sent = totals([[0] * 3, [10_000] * 3, [40_000] * 3])
+    pulses, _ = run([0, 1, 5], TOTALS, gyro=sent)
+    assert pulses["flags"].tolist() == [Flag.VALID, Flag.LONG_INTERVAL | Flag.SATURATED]
+
+
+@pytest.mark.parametrize(
+    ("status", "flags"),
+    [
+        (0, Flag.VALID),
+        (1 << 0, Flag.VALID | Flag.WARM_UP),
+        *((1 << bit, Flag.FAULT) for bit in (*range(1, 10), 15)),
+        (1 << 10, Flag.SATURATED),
+        (1 << 11, Flag.VALID),  # reserved
+    ],
+)
+def test_status_bits_become_flags(status, flags):
+    pulses, _ = run([1], status=status)
+    assert pulses["flags"].tolist() == [flags]
+    assert pulses["status"].tolist() == [status]
+
+
+@pytest.mark.parametrize(("pulse", "saturated"), [(2**31 - 1, True), (-(2**31), True), (2**31 - 2, False)])
+@pytest.mark.parametrize("sensor", ["gyro", "accelerometer"])
+def test_a_count_at_the_end_of_its_width_is_saturated(sensor, pulse, saturated):
+    pulses, _ = run([1], **{sensor: [[0, pulse, 0]]})
+    assert pulses["flags"].tolist() == [Flag.SATURATED if saturated else Flag.VALID]
+    assert pulses[sensor].tolist() == [[0, pulse, 0]]
+
+
+def test_temperatures_become_degrees_and_unheard_ones_are_not_known():
+    counts = np.zeros((1, 6), np.int32)
+    counts[0, :4] = [3512, NO_TEMPERATURE, -5, 0]
+    pulses, _ = run([1], temperature=counts)
+    expected = [35.12, np.nan, -0.05, 0.0, np.nan, np.nan]
+    assert np.array_equal(pulses["temperature_degc"][0], expected, equal_nan=True)
+
+
+# Steps of the counter (on, doubled, a gap, back a little, back far, far ahead), damaged, torn.
+STEPS = st.sampled_from([1, 1, 1, 1, 0, 2, 5, 63, 64, 65, -1, -3, -63, -64, -200, 300, 5000])
+ARRIVALS = st.lists(st.tuples(STEPS, st.integers(0, 4), st.integers(0, 3)), min_size=1, max_size=60)
+
+
+@given(st.integers(0, 2**32 - 1), ARRIVALS, st.sampled_from([8, 16, 32]), st.booleans(), st.integers(0, 60))
+def test_the_account_closes_for_any_counters_and_any_batches(first, arrivals, bits, running, cut):
+    layout = replace(TOTALS if running else INCREMENTS, counter_bits=bits)
+    steps, damaged, torn = np.array(arrivals).T
+    gyro = np.random.default_rng(first).integers(0, 100, (len(steps), 3))
+    rows = frames((first + np.cumsum(steps)) % 2**bits, damaged=damaged, torn=torn, gyro=gyro)
+
+    one_by_one = Accountant(layout)
+    pieces = []
+    for i in range(len(rows)):
+        pieces.append(one_by_one.feed(rows[i : i + 1]))
+        assert one_by_one.account.closes
+        assert min(vars(one_by_one.account).values()) >= 0
+    single = np.concatenate(pieces)
+    assert len(single) == one_by_one.account.good
+    assert np.all(np.diff(single["elapsed_ns"]) > 0)
+
+    in_batches = Accountant(layout)
+    batches = np.concatenate([in_batches.feed(rows[:cut]), in_batches.feed(rows[cut:])])
+    assert in_batches.account == one_by_one.account
+    for name in single.dtype.names:
+        assert np.array_equal(batches[name], single[name], equal_nan=name == "temperature_degc")

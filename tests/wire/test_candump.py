@@ -1,0 +1,208 @@
+"""Candump text both ways, against a second reader made of one regular expression."""
+
+import re
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from imudrv.errors import InputError
+from imudrv.records import MESSAGE, REJECT, Reason
+from imudrv.wire.candump import LONGEST_LINE, CandumpDecoder, format_candump
+
+LINE = re.compile(
+    rb"\((\d{1,10})\.(\d{1,9})\)[ \t\r]+[^\x00-\x20]+[ \t\r]+([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})"
+    rb"#(#[0-9A-Fa-f])?((?:[0-9A-Fa-f]{2})*)(?:[ \t\r]+[RT])?[ \t\r]*"
+)
+
+
+def record(t_ns: int, identifier: int, data: bytes, fd: bool = False) -> np.ndarray:
+    message = np.zeros(1, MESSAGE)
+    message["t_ns"], message["id"], message["length"], message["fd"] = t_ns, identifier, len(data), fd
+    message["data"][0, : len(data)] = list(data)
+    return message
+
+
+def decoded(*pieces: bytes):
+    """Messages and rejects of all pieces, the end included, with the accounting checked on the way."""
+    decoder = CandumpDecoder()
+    found = []
+    for piece in pieces:
+        found.append(decoder.feed(piece))
+        assert decoder._line.size <= LONGEST_LINE + 1
+    assert decoder.bytes_fed == sum(map(len, pieces))
+    found.append(decoder.close())
+    assert decoder.pending == 0
+    assert decoder.bytes_fed == sum(map(len, pieces))
+    messages, rejects = zip(*found, strict=True)
+    return np.concatenate(messages), np.concatenate(rejects)
+
+
+def read_by_expression(text: bytes):
+    """What `decoded` should give; every byte of `text` is looked at in exactly one line."""
+    messages, rejects = [np.zeros(0, MESSAGE)], []
+    offset = 0
+    for line in re.findall(rb"[^\n]*\n|[^\n]+", text):
+        content = line.removesuffix(b"\n")
+        reason = Reason.NOT_A_MESSAGE if line.endswith(b"\n") else Reason.UNFINISHED
+        match = LINE.fullmatch(content) if len(content) <= LONGEST_LINE else None
+        if match is not None:
+            seconds, fraction, identifier, fd, digits = match.groups()
+            data = bytes.fromhex(digits.decode())
+            fits = int(identifier, 16) <= (0x7FF if len(identifier) == 3 else 0x1FFFFFFF)
+            if fits and len(data) <= (64 if fd else 8) and int(seconds) < 9_223_372_035:
+                t_ns = int(seconds) * 10**9 + int(fraction.ljust(9, b"0"))
+                messages.append(record(t_ns, int(identifier, 16), data, fd is not None))
+            else:
+                rejects.append((offset, len(line), reason))
+        elif content.strip(b" \t\r") or len(content) > LONGEST_LINE:
+            rejects.append((offset, len(line), reason))
+        offset += len(line)
+    return np.concatenate(messages), np.array(rejects, REJECT)
+
+
+GOOD = b"(1700000000.123456) can0 150#0001FFFF02004000\n"
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        (GOOD, record(1_700_000_000_123_456_000, 0x150, bytes.fromhex("0001FFFF02004000"))),
+        (b"(1.000000001) vcan-1 00000158##1abCD\r\n", record(1_000_000_001, 0x158, b"\xab\xcd", fd=True)),
+        (b"(0.5) can0 1FFFFFFF#\n", record(500_000_000, 0x1FFFFFFF, b"")),
+        (b"(0000000012.000000)  can0\t7ff#00 R\n", record(12 * 10**9, 0x7FF, b"\0")),
+        (b"(12.000000) can0 7FF#00 T\r\n", record(12 * 10**9, 0x7FF, b"\0")),
+        (b"(12.0) c 001##0" + b"5A" * 64 + b"\n", record(12 * 10**9, 1, b"\x5a" * 64, fd=True)),
+        (b"(12.0) c 001#01", record(12 * 10**9, 1, b"\1")),
+    ],
+)
+def test_a_line_becomes_its_message(line, message):
+    messages, rejects = decoded(line)
+    assert np.array_equal(messages, message)
+    assert rejects.size == 0
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"(1700000000.123456) can0 150#R",
+        b"(1700000000.123456) can0 150#R8",
+        b"(1700000000.123456) can0 150#000",
+        b"(1700000000.123456) can0 150#000102030405060708",
+        b"(1700000000.123456) can0 158##1" + b"00" * 65,
+        b"(1700000000.123456) can0 158##",
+        b"(1700000000.123456) can0 1500#00",
+        b"(1700000000.123456) can0 FFF#00",
+        b"(1700000000.123456) can0 20000000#00",
+        b"(1700000000.123456) can0 150#00 X",
+        b"(1700000000.123456) can0 150#00R",
+        b"(1700000000.123456) can0150#00",
+        b"(1700000000.123456)can0 150#00",
+        b"(1700000000) can0 150#00",
+        b"(.5) can0 150#00",
+        b"(1.) can0 150#00",
+        b"(99999999999.5) can0 150#00",
+        b"(9999999999.5) can0 150#00",
+        b"(1.0123456789) can0 150#00",
+        b"1700000000.123456 can0 150#00",
+        b"(1.0) " + b"c" * LONGEST_LINE + b" 150#00",
+        b" " * (LONGEST_LINE + 1),
+        b"\0\0\0\0",
+        b"x",
+    ],
+)
+def test_a_bad_line_is_one_reject_and_costs_no_other(line):
+    text = GOOD + line + b"\n" + GOOD
+    messages, rejects = decoded(text)
+    assert messages.size == 2
+    assert messages[0] == messages[1]
+    assert rejects.tolist() == [(len(GOOD), len(line) + 1, Reason.NOT_A_MESSAGE)]
+
+
+def test_blank_lines_are_nothing():
+    messages, rejects = decoded(b"\n\r\n \t\r\n" + GOOD + b"\n")
+    assert (messages.size, rejects.size) == (1, 0)
+
+
+def test_a_cut_last_line_is_unfinished():
+    _, rejects = decoded(GOOD + GOOD[:30])
+    assert rejects.tolist() == [(len(GOOD), 30, Reason.UNFINISHED)]
+
+
+def test_a_line_without_end_is_not_kept():
+    decoder = CandumpDecoder()
+    for _ in range(100):
+        decoder.feed(b"x" * 1000)
+        assert decoder._line.size <= LONGEST_LINE + 1
+    assert decoder.pending == 100_000
+    messages, rejects = decoder.feed(b"\nx\n" + GOOD)
+    assert messages.size == 1
+    assert rejects.tolist() == [(0, 100_001, Reason.NOT_A_MESSAGE), (100_001, 2, Reason.NOT_A_MESSAGE)]
+
+
+def test_written_messages_are_read_again():
+    random = np.random.default_rng(1)
+    messages = np.concatenate(
+        [
+            record(
+                int(random.integers(0, 2**62)) // 1000 * 1000,
+                int(random.integers(0, 0x800 if i % 2 else 0x20000000)),
+                random.bytes(random.integers(0, 65 if fd else 9)),
+                fd,
+            )
+            for i in range(200)
+            for fd in (False, True)
+        ]
+    )
+    again, rejects = decoded(format_candump(messages, "can1"))
+    assert rejects.size == 0
+    assert np.array_equal(again, messages)
+
+
+def test_written_text_is_what_candump_writes():
+    classic = record(1_700_000_000_123_456_789, 0x150, bytes.fromhex("0001ffff02004000"))
+    fd = record(5_000_001_000, 0x18FF0001, b"\xab", fd=True)
+    assert format_candump(classic) == GOOD
+    assert format_candump(fd, "can1") == b"(0000000005.000001) can1 18FF0001##1AB\n"
+    assert format_candump(classic[:0]) == b""
+
+
+def test_what_a_log_cannot_hold_is_refused():
+    with pytest.raises(InputError, match=r"message 1: expected a time from 1970 on, got -1 ns"):
+        format_candump(np.concatenate([record(0, 1, b""), record(-1, 1, b"")]))
+    for channel in ("", "can 0", "a" * 17, "can\n"):
+        with pytest.raises(InputError, match="channel: expected 1 to 16 printable"):
+            format_candump(record(0, 1, b""), channel)
+
+
+LINES = st.one_of(
+    st.just(GOOD),
+    st.tuples(
+        st.sampled_from([b"(1.5)", b"(9999999999.5)", b"(0001.123456789)", b"(1.)"]),
+        st.sampled_from([b" can0 ", b"\tc\r ", b" ", b" c0" * 2]),
+        st.sampled_from([b"150#", b"7FF#", b"800#", b"00000150##1", b"1fffffff#", b"150##", b"15#"]),
+        st.integers(0, 66)
+        .flatmap(lambda n: st.binary(min_size=n, max_size=n))
+        .map(lambda b: b.hex().encode()),
+        st.sampled_from([b"\n", b" R\n", b"\tT \r\n", b"R\n", b" R T\n", b"0\n", b""]),
+    ).map(b"".join),
+    st.sampled_from(
+        [b"\n", b" \r\n", b"x" * 300 + b"\n", b"x" * 255, b"(1.0) c 150#", b"00" * 9 + b" T\r\n"]
+    ),
+    st.binary(max_size=20),
+    st.tuples(st.integers(0, len(GOOD) - 1), st.integers(0, 255)).map(
+        lambda change: GOOD[: change[0]] + bytes([change[1]]) + GOOD[change[0] + 1 :]
+    ),
+)
+
+
+@settings(deadline=None, max_examples=150)
+@given(st.lists(LINES, max_size=8).map(b"".join), st.lists(st.integers(0, 600), max_size=6))
+def test_any_text_in_any_pieces_gives_what_the_expression_gives(text, cuts):
+    edges = [0, *sorted(min(cut, len(text)) for cut in cuts), len(text)]
+    messages, rejects = decoded(*(text[a:b] for a, b in pairwise(edges)))
+    expected_messages, expected_rejects = read_by_expression(text)
+    assert np.array_equal(messages, expected_messages)
+    assert rejects.tolist() == expected_rejects.tolist()
