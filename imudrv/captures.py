@@ -71,7 +71,10 @@ class Capture:
                 advance(len(data))
         yield self.accountant.feed(self.decoder.close())
         if self.accountant.account.frames == 0:
-            raise InputError(f"{self.path}: expected frames of {self.layout.name}, got none in {self.size} bytes{self._hint()}")
+            raise InputError(
+                f"{self.path}: expected frames of {self.layout.name}, "
+                f"got none in {self.size} bytes{self._hint()}"
+            )
 
     def increments(self, compensator: Compensator, advance: Callable[[int], None]) -> Iterator[Records]:
         """Decode and compensate the file, piece by piece.

@@ -7,16 +7,17 @@ from pathlib import Path
 from imudrv import config, profiles
 from imudrv.calibration import Calibration, coefficients, read_calibration
 from imudrv.captures import Capture
+from imudrv.config import Model
 from imudrv.console import guarded, progress
+from imudrv.demo import demo
 from imudrv.errors import InputError
 from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import NAMES, rate_filter
 from imudrv.profiles import Profile
 from imudrv.sim import scenario as scenarios
 from imudrv.sim.capture import record
-from imudrv.sim.demo import demo
 from imudrv.sim.scenario import Scenario
-from imudrv.sinks.files import NpzTable, increment_columns, pulse_columns, replacing, table
+from imudrv.sinks.files import increment_columns, pulse_columns, replacing, table
 from imudrv.site import Site
 
 
@@ -47,41 +48,58 @@ def _parser() -> argparse.ArgumentParser:
         sub.set_defaults(command=command)
         return sub
 
-    profile = {"required": True, "metavar": "P", "help": f"{', '.join(profiles.shipped())}, or a profile file"}
+    def add_profile(sub: argparse.ArgumentParser) -> None:
+        text = f"{', '.join(profiles.shipped())}, or a profile file"
+        sub.add_argument("--profile", required=True, metavar="P", help=text)
 
     sub = add("decode", _decode, "Capture to pulse increments.")
     sub.add_argument("capture", type=Path, help="wire bytes; for a CAN profile a candump log")
-    sub.add_argument("--profile", **profile)
+    add_profile(sub)
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="NAME.csv or NAME.npz")
 
     sub = add("compensate", _compensate, "Capture to compensated increments in body axes.")
     sub.add_argument("capture", type=Path, help="wire bytes; for a CAN profile a candump log")
-    sub.add_argument("--profile", **profile)
-    sub.add_argument("--calibration", type=Path, required=True, metavar="C.yaml", help="the unit's calibration file")
-    sub.add_argument("--unit", metavar="SERIAL", help="serial number of the unit; another unit's calibration is refused")
-    sub.add_argument("--rate-filter", choices=NAMES, default="causal", help="for the size effect (default: causal)")
-    sub.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="NAME.csv, NAME.npz or NAME.i50n")
+    add_profile(sub)
+    sub.add_argument(
+        "--calibration", type=Path, required=True, metavar="C.yaml", help="the unit's calibration file"
+    )
+    sub.add_argument(
+        "--unit", metavar="SERIAL", help="serial number of the unit; another unit's calibration is refused"
+    )
+    sub.add_argument(
+        "--rate-filter", choices=NAMES, default="causal", help="for the size effect (default: causal)"
+    )
+    sub.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="OUT", help="NAME.csv, NAME.npz or NAME.i50n"
+    )
 
     sub = add("sim", _sim, "A simulated unit's output as a capture.")
     sub.add_argument("scenario", help=f"{', '.join(scenarios.shipped())}, or a scenario file")
-    sub.add_argument("--profile", **profile)
-    sub.add_argument("-o", "--output", type=Path, required=True, metavar="CAPTURE", help="the capture to write")
+    add_profile(sub)
+    sub.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="CAPTURE", help="the capture to write"
+    )
     sub.add_argument("--truth", type=Path, metavar="FILE.npz", help="what really happened, sample by sample")
 
     sub = add("check", _check, "Check a calibration, site, profile or scenario file.")
     sub.add_argument("file", type=Path, help="the file")
 
-    add("demo", lambda _: demo(print), "The bench procedure on a simulated unit, from wire bytes to velocity.")
+    add(
+        "demo", lambda _: demo(print), "The bench procedure on a simulated unit, from wire bytes to velocity."
+    )
     return parser
 
 
 def _decode(arguments: argparse.Namespace) -> None:
     layout = profiles.load(arguments.profile).layout()
     capture = Capture(arguments.capture, layout)
-    with table(arguments.output, (".csv", ".npz"), {"temperature_degc": layout.temperature_names}) as rows:
-        with progress("decode", capture.size) as advance:
-            for pulses in capture.pulses(advance):
-                rows.write(pulse_columns(pulses, layout))
+    parts = {"temperature_degc": layout.temperature_names}
+    with (
+        table(arguments.output, (".csv", ".npz"), parts) as rows,
+        progress("decode", capture.size) as advance,
+    ):
+        for pulses in capture.pulses(advance):
+            rows.write(pulse_columns(pulses, layout))
     _report(capture, arguments.output)
 
 
@@ -92,12 +110,16 @@ def _compensate(arguments: argparse.Namespace) -> None:
         coefficients(calibration), layout, rate_filter(arguments.rate_filter, layout.interval_ns)
     )
     capture = Capture(arguments.capture, layout)
-    with table(arguments.output, (".csv", ".npz", ".i50n"), {}) as rows:
-        with progress("compensate", capture.size) as advance:
-            for increments in capture.increments(compensator, advance):
-                rows.write(increment_columns(increments))
+    with (
+        table(arguments.output, (".csv", ".npz", ".i50n"), {}) as rows,
+        progress("compensate", capture.size) as advance,
+    ):
+        for increments in capture.increments(compensator, advance):
+            rows.write(increment_columns(increments))
     _report(capture, arguments.output)
-    size_effect = "compensated" if calibration.size_effect else "not compensated: the calibration has no sensing points"
+    size_effect = (
+        "compensated" if calibration.size_effect else "not compensated: the calibration has no sensing points"
+    )
     print(f"  unit {calibration.serial_number}, calibration {config.sha256(arguments.calibration)[:12]}")
     print(f"  size effect {size_effect}; rate filter {arguments.rate_filter}, {compensator.lag} samples late")
 
@@ -123,7 +145,7 @@ def _sim(arguments: argparse.Namespace) -> None:
 
 
 def _check(arguments: argparse.Namespace) -> None:
-    kinds = {
+    kinds: dict[str, type[Model]] = {
         "imu50-calibration": Calibration,
         "imu50-site": Site,
         "imu50-profile": Profile,
@@ -138,16 +160,10 @@ def _check(arguments: argparse.Namespace) -> None:
 
 def _report(capture: Capture, output: Path) -> None:
     """The books of a capture, for people."""
-    account = capture.accountant.account
     print(f"{capture.path}: {capture.layout.name}, {capture.size} bytes -> {output}")
-    print(f"  {account.expected} samples by the counter = {account.good} good", end="")
-    for name in ("base", "damaged", "torn", "missing", "late"):
-        if count := getattr(account, name):
-            print(f" + {count} {name}", end="")
-    print(f"; {account.duplicate} duplicate, {account.restarts} restarts of the unit")
-    if account.bridged:
-        print(f"  {account.bridged} of the lost ones are bridged by running totals: no pulse of theirs is lost")
+    print(f"  {capture.accountant.account}")
     for reason, rejected in sorted(capture.decoder.rejected.items()):
+        name = reason.name.lower().replace("_", " ")
         first = ", ".join(map(str, rejected.first))
         more = ", ..." if rejected.stretches > len(rejected.first) else ""
-        print(f"  {reason.name.lower().replace('_', ' ')}: {rejected.stretches} x, {rejected.length} in all, at {first}{more}")
+        print(f"  {name}: {rejected.stretches} x, {rejected.length} in all, at {first}{more}")

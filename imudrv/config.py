@@ -24,7 +24,7 @@ from typing import Annotated, Any, Final, Literal, TypeAlias, TypeVar, get_args,
 import yaml
 from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, ValidationError
 
-from imudrv.errors import FileFaults, InputError
+from imudrv.errors import FaultyFileError, InputError
 
 MAX_BYTES: Final = 1 << 20
 """Largest settings file, bytes."""
@@ -78,7 +78,7 @@ def read(path: str | os.PathLike[str], model: type[M]) -> M:
     ------
     InputError
         The file cannot be read.
-    FileFaults
+    FaultyFileError
         It is no YAML, or not what the model says; all faults at once.
     """
     name = os.fspath(path)
@@ -103,16 +103,16 @@ def parse(document: object, model: type[M], name: str) -> M:
 
     Raises
     ------
-    FileFaults
+    FaultyFileError
         It is not what the model says; all faults at once.
     """
     if faults := list(_header_faults(document, model)):
-        raise FileFaults(name, faults)
+        raise FaultyFileError(name, faults)
     try:
         # As JSON, because strict then takes a list for a tuple and text for a date, yet no text for a number.
         return model.model_validate_json(json.dumps(document, default=datetime.isoformat))
     except ValidationError as error:
-        raise FileFaults(name, _bounded(_faults(error, document, model))) from None
+        raise FaultyFileError(name, _bounded(_faults(error, document, model))) from None
 
 
 def kind(path: str | os.PathLike[str]) -> str:
@@ -136,13 +136,15 @@ def kind(path: str | os.PathLike[str]) -> str:
     name = os.fspath(path)
     document = _load(_content(Path(path)), name)
     if not isinstance(document, dict):
-        raise FileFaults(name, [f"expected a mapping (key: value), got {_shown(document)}"])
+        raise FaultyFileError(name, [f"expected a mapping (key: value), got {_shown(document)}"])
     if "format" not in document and "latitude_deg" in document:
         return "imu50-site"
     found = document.get("format")
     if not isinstance(found, str):
         came = _shown(found) if "format" in document else "no such key"
-        raise FileFaults(name, [f"format: expected what the file is, such as imu50-calibration, got {came}"])
+        raise FaultyFileError(
+            name, [f"format: expected what the file is, such as imu50-calibration, got {came}"]
+        )
     return found
 
 
@@ -303,7 +305,7 @@ def _load(data: bytes, name: str) -> object:
         character = f"0x{error.character:02x}"
         faults.append(f"expected text, got the control character {character}; is it another file?")
     if faults:
-        raise FileFaults(name, _bounded(faults))
+        raise FaultyFileError(name, _bounded(faults))
     return document
 
 

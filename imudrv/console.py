@@ -68,7 +68,14 @@ def progress(title: str, total: int) -> Iterator[Callable[[int], None]]:
         To be told how much more is done.
     """
     console = Console(stderr=True)
-    bar = Progress(TextColumn(title), BarColumn(), TaskProgressColumn(), TimeRemainingColumn(), console=console, transient=True)
+    bar = Progress(
+        TextColumn(title),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeRemainingColumn(),
+        console=console,
+        transient=True,
+    )
     task = bar.add_task(title, total=total)
     begun = time.monotonic()
 

@@ -15,7 +15,7 @@ class InputError(Imu50Error):
     """What the user gave cannot be used: a file, an option, a value."""
 
 
-class FileFaults(InputError):
+class FaultyFileError(InputError):
     """A settings file with faults, all of them told at once.
 
     Parameters

@@ -1,27 +1,33 @@
 """The decorator of every numba kernel: compiled once for a user, and never stale.
 
 numba keeps compiled code beside the source and looks only at the file that holds the kernel, so a change in a
-helper of another file would go unseen. Here the cache folder carries a hash of all sources of the package.
+helper of another file would go unseen. Here the cache folder carries a hash of all sources that kernels read.
 """
 
 import hashlib
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar, cast
 
-import numba
 from numba import njit
+from numba.core import config
 
 F = TypeVar("F", bound=Callable[..., Any])
 
+CONSTANTS: Final = ("records.py", "units.py", "wire/layout.py")
+"""Files without kernels whose constants kernels read."""
+
 
 def _cache_folder() -> str:
-    sources = hashlib.sha256()
-    for source in sorted(Path(__file__).parent.rglob("*.py")):
-        sources.update(source.read_bytes())
+    package = Path(__file__).parent
+    digest = hashlib.sha256()
+    for source in sorted(package.rglob("*.py")):
+        text = source.read_bytes()
+        if b"@kernel" in text or source.relative_to(package).as_posix() in CONSTANTS:
+            digest.update(text)
     home = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return str(Path(home) / "imu50" / f"kernels-{sources.hexdigest()[:16]}")
+    return str(Path(home) / "imu50" / f"kernels-{digest.hexdigest()[:16]}")
 
 
 _FOLDER = _cache_folder()
@@ -40,10 +46,10 @@ def kernel(function: F) -> F:
     callable
         The same function, compiled; releases the interpreter lock, divides as IEEE 754 says.
     """
-    before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = _FOLDER
+    settings: Any = config  # numba makes its settings' names at run time
+    before = settings.CACHE_DIR
+    settings.CACHE_DIR = _FOLDER
     try:
-        compiled: F = njit(cache=True, nogil=True, error_model="numpy", forceinline=True)(function)
+        return cast(F, njit(cache=True, nogil=True, error_model="numpy", forceinline=True)(function))
     finally:
-        numba.config.CACHE_DIR = before
-    return compiled
+        settings.CACHE_DIR = before

@@ -51,7 +51,10 @@ PULSES: Final = np.dtype(
     [
         ("counter", np.int64),  # unwrapped
         ("arrival_ns", np.int64),  # host clock
-        ("elapsed_ns", np.int64),  # end of the interval by the counter alone, from the first sample's beginning
+        (
+            "elapsed_ns",
+            np.int64,
+        ),  # end of the interval by the counter alone, from the first sample's beginning
         ("interval_ns", np.int64),  # that the pulses cover
         ("gyro", np.int64, 3),
         ("accelerometer", np.int64, 3),

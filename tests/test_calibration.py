@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from imudrv.calibration import Calibration, coefficients, read_calibration, write_calibration
 from imudrv.config import kind, parse, read, write
-from imudrv.errors import FileFaults, InputError
+from imudrv.errors import FaultyFileError, InputError
 from imudrv.site import Site
 
 REFERENCE = Path(__file__).parents[2] / "shared" / "data" / "reference"
@@ -91,7 +91,7 @@ def calibration(document: dict[str, Any] = DOCUMENT) -> Calibration:
 
 
 def fault(document: dict[str, Any]) -> str:
-    with pytest.raises(FileFaults) as caught:
+    with pytest.raises(FaultyFileError) as caught:
         calibration(document)
     (only,) = caught.value.faults
     return only
@@ -237,7 +237,7 @@ def test_the_compensation_gets_what_the_certificate_says() -> None:
 )
 def test_a_fault_names_its_place(path: str, value: Any, words: str) -> None:
     document = changed(path, value)
-    with pytest.raises(FileFaults) as caught:
+    with pytest.raises(FaultyFileError) as caught:
         calibration(document)
     assert caught.value.faults[0].startswith(words)
 
@@ -415,7 +415,7 @@ def test_a_written_site_says_that_it_is_one(tmp_path: Path) -> None:
     ],
 )
 def test_a_site_that_cannot_be_is_refused(key: str, value: object, words: str) -> None:
-    with pytest.raises(FileFaults) as caught:
+    with pytest.raises(FaultyFileError) as caught:
         parse({**SITE, key: value}, Site, "site.yaml")
     (only,) = caught.value.faults
     assert only.startswith(words)

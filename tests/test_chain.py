@@ -73,11 +73,14 @@ ROCKING: list[dict[str, object]] = [
 ]
 
 
-def driven(profile: str, run: Scenario, calibration: Calibration, filter_name: str = "causal") -> tuple[Records, Records]:
+def driven(
+    profile: str, run: Scenario, calibration: Calibration, filter_name: str = "causal"
+) -> tuple[Records, Records]:
     """Compensated increments and the truth of the same samples."""
     layout = profiles.load(profile).layout()
     decoder, accountant = CaptureDecoder(layout), Accountant(layout)
-    compensator = Compensator(coefficients(calibration), layout, rate_filter(filter_name, layout.interval_ns))  # type: ignore[arg-type]
+    rates = rate_filter(filter_name, layout.interval_ns)  # type: ignore[arg-type]
+    compensator = Compensator(coefficients(calibration), layout, rates)
     got, truth = [], []
     for data, true in record(run, layout):
         got.append(compensator.feed(accountant.feed(decoder.feed(data))))
@@ -96,15 +99,15 @@ def test_truth_comes_back_within_the_quantisation(profile: str) -> None:
     arcsec, pulse_per_m_s = 0.5, 2000.0
     calibration = unit(arcsec, pulse_per_m_s)
     increments, truth = driven(profile, scenario(calibration, ROCKING), calibration)
-    # The temperature goes out in 0.01 K, and over CAN is known from the first 0x152 on: no error at 38.00 degC.
+    # The temperature goes out in 0.01 K, over CAN it is known from the first 0x152 on: no error at 38 degC.
     assert np.all(increments["flags"] & Flag.VALID)
-    # Pulses are rounded with carry: a sum of increments is off by half a pulse at each end, 1.1 the largest scale,
-    # misalignment mixes in 0.5 % of the others.
+    # Pulses are rounded with carry: a sum of increments is off by half a pulse at each end, 1.1 the largest
+    # scale, misalignment mixes in 0.5 % of the others.
     angle = np.abs(np.cumsum(increments["dtheta_b"] - truth["dtheta_b"], axis=0))
     assert angle.max() < 1.1 * 1.006 * arcsec * ARCSEC
-    # Velocity: the same of its own pulses (0.8 the smallest scale), and the size effect of a rate that is wrong by
-    # no more than sum |h| = 20/6 pulses an interval at the end of the sum and at its beginning, on arms of 39 mm;
-    # the centripetal part of that error averages out to less than a tenth of it.
+    # Velocity: the same of its own pulses (0.8 the smallest scale), and the size effect of a rate wrong
+    # by no more than sum |h| = 20/6 pulses an interval at the end of the sum and at its begin, on arms of
+    # 39 mm; the centripetal part of that error averages out to less than a tenth of it.
     pulse = 1.006 / (0.8 * pulse_per_m_s)
     rate = 20.0 / 6.0 * 1.1 * arcsec * ARCSEC / 1e-3
     settled = slice(4, None)  # the first samples have no size effect compensated, the body still rests
@@ -113,7 +116,9 @@ def test_truth_comes_back_within_the_quantisation(profile: str) -> None:
 
 
 @pytest.mark.parametrize("filter_name", ["causal", "centred", "dither"])
-def test_the_size_effect_of_rocking_is_taken_off_to_a_tenth_of_a_micrometre_a_second(filter_name: str) -> None:
+def test_the_size_effect_of_rocking_is_taken_off_to_a_tenth_of_a_micrometre_a_second(
+    filter_name: str,
+) -> None:
     calibration = unit(2e-5, 2e8)  # so fine that pulses hide nothing
     run = scenario(calibration, ROCKING)
     increments, truth = driven("imu50-canfd", run, calibration, filter_name)

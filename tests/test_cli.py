@@ -28,7 +28,11 @@ faults:
 
 def imudrv(*arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "imudrv", *map(str, arguments)], cwd=cwd, capture_output=True, text=True, timeout=300
+        [sys.executable, "-m", "imudrv", *map(str, arguments)],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        timeout=300,
     )
 
 
@@ -38,7 +42,9 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("bench")
     (folder / "run.yaml").write_text(SCENARIO)
     (folder / "unit.yaml").write_text(CALIBRATION)
-    done = imudrv("sim", "run.yaml", "--profile", "imu50-rs422", "-o", "run.raw", "--truth", "truth.npz", cwd=folder)
+    done = imudrv(
+        "sim", "run.yaml", "--profile", "imu50-rs422", "-o", "run.raw", "--truth", "truth.npz", cwd=folder
+    )
     assert done.returncode == 0, done.stderr
     return folder
 
@@ -91,7 +97,15 @@ def test_decode_accounts_for_every_sample_and_writes_what_the_manual_says(bench:
 def test_csv_and_npz_hold_the_same_bits(bench: Path) -> None:
     for name in ("inc.csv", "inc.npz", "inc.i50n"):
         done = imudrv(
-            "compensate", "run.raw", "--profile", "imu50-rs422", "--calibration", "unit.yaml", "-o", name, cwd=bench
+            "compensate",
+            "run.raw",
+            "--profile",
+            "imu50-rs422",
+            "--calibration",
+            "unit.yaml",
+            "-o",
+            name,
+            cwd=bench,
         )
         assert done.returncode == 0, done.stderr
         assert "size effect compensated" in done.stdout
@@ -119,15 +133,35 @@ def test_a_candump_log_works_for_the_can_profiles(bench: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["decode", "nothing.raw", "--profile", "imu50-rs422", "-o", "o.npz"], "nothing.raw: expected a capture"),
+        (
+            ["decode", "nothing.raw", "--profile", "imu50-rs422", "-o", "o.npz"],
+            "nothing.raw: expected a capture",
+        ),
         (["decode", "run.raw", "--profile", "imu51", "-o", "o.npz"], "expected one of imu50-can"),
-        (["decode", "run.raw", "--profile", "imu50-rs422", "-o", "o.txt"], "expected a name ending in .csv, .npz"),
+        (
+            ["decode", "run.raw", "--profile", "imu50-rs422", "-o", "o.txt"],
+            "expected a name ending in .csv, .npz",
+        ),
         (["decode", "run.raw", "--profile", "imu50-rs422", "-o", "no/o.npz"], "cannot be written"),
         (["decode", "run.raw", "--profile", "imu50-rs422-acc", "-o", "o.npz"], "try --profile imu50-rs422"),
         (["decode", "unit.yaml", "--profile", "imu50-rs422", "-o", "o.npz"], "is it the right file"),
-        (["compensate", "run.raw", "--profile", "imu50-rs422", "--calibration", "run.yaml", "-o", "o.npz"], "imu50-calibration"),
         (
-            ["compensate", "run.raw", "--profile", "imu50-rs422", "--calibration", "unit.yaml", "--unit", "50-0018", "-o", "o.npz"],
+            ["compensate", "run.raw", "--profile", "imu50-rs422", "--calibration", "run.yaml", "-o", "o.npz"],
+            "imu50-calibration",
+        ),
+        (
+            [
+                "compensate",
+                "run.raw",
+                "--profile",
+                "imu50-rs422",
+                "--calibration",
+                "unit.yaml",
+                "--unit",
+                "50-0018",
+                "-o",
+                "o.npz",
+            ],
             "50-0017",
         ),
         (["sim", "unit.yaml", "--profile", "imu50-rs422", "-o", "o.raw"], "imu50-scenario"),

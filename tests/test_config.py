@@ -16,7 +16,7 @@ from pydantic import Field, JsonValue
 
 from imudrv import config
 from imudrv.config import Matrix3, Model, UtcTime, Vector3, kind, parse, read, sha256, write
-from imudrv.errors import FileFaults, InputError
+from imudrv.errors import FaultyFileError, InputError
 
 
 class Line(Model):
@@ -51,7 +51,7 @@ HEADER = {"format": "test-settings", "version": 1}
 
 
 def faults_of(document: object, model: type[Model] = Settings) -> tuple[str, ...]:
-    with pytest.raises(FileFaults) as caught:
+    with pytest.raises(FaultyFileError) as caught:
         parse(document, model, "a document")
     return caught.value.faults
 
@@ -68,7 +68,7 @@ def file(tmp_path: Path) -> Path:
 
 def faults_in(file: Path, text: str | bytes) -> str:
     file.write_bytes(text.encode() if isinstance(text, str) else text)
-    with pytest.raises(FileFaults) as caught:
+    with pytest.raises(FaultyFileError) as caught:
         read(file, Settings)
     return str(caught.value)
 
@@ -311,7 +311,9 @@ def test_a_billion_laughs_do_not_grow(file: Path) -> None:
 
 @pytest.mark.parametrize("opening", ["[", "[[1], ", "- ", "{a: "])
 def test_deep_nesting_is_refused_not_recursed(file: Path, opening: str) -> None:
-    assert f"expected at most {config.MAX_DEPTH} levels of nesting" in faults_in(file, opening * 10_000)
+    # 500 levels: below the bound that some builds of libyaml have of their own.
+    assert f"expected at most {config.MAX_DEPTH} levels of nesting" in faults_in(file, opening * 500)
+    assert "nesting" in faults_in(file, opening * 10_000)
 
 
 def test_the_deepest_nesting_that_is_said_to_be_allowed_is(file: Path) -> None:
@@ -410,7 +412,7 @@ def test_a_path_that_cannot_be_is_told(path: str) -> None:
 
 
 def kind_fault(file: Path) -> str:
-    with pytest.raises(FileFaults) as caught:
+    with pytest.raises(FaultyFileError) as caught:
         kind(file)
     (only,) = caught.value.faults
     return only

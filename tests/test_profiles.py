@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from imudrv import profiles
-from imudrv.errors import FileFaults, InputError
+from imudrv.errors import FaultyFileError, InputError
 from imudrv.imu.accounting import Accountant
 from imudrv.records import PULSES, Flag, Records
 from imudrv.wire.encode import StreamEncoder
@@ -45,7 +45,9 @@ def message(sync_bytes: int, pulse: str, counter: str, check: dict[str, object] 
         for axis in "zyx":
             fields.append({"name": name, "axis": axis, "type": pulse, "offset": at})
             at += width
-    fields.append({"name": "temperature", "sensor": "gyro", "type": "i8", "offset": at, "degc_per_count": 0.5})
+    fields.append(
+        {"name": "temperature", "sensor": "gyro", "type": "i8", "offset": at, "degc_per_count": 0.5}
+    )
     at += 1
     made: dict[str, object] = {"sync": "AA 55 0D"[: 3 * sync_bytes - 1], "fields": fields}
     if check:
@@ -132,7 +134,9 @@ def test_an_invented_profile_works_by_path_without_code(document: dict[str, obje
     wire = StreamEncoder(layout).encode(sent).tobytes()
     decoder, accountant = StreamDecoder(layout), Accountant(layout)
     noise = b"\xaa\x55\x00\x0d"
-    found = [accountant.feed(decoder.feed(piece).frames) for piece in (noise + wire[:1111], wire[1111:], b"tail")]
+    found = [
+        accountant.feed(decoder.feed(piece).frames) for piece in (noise + wire[:1111], wire[1111:], b"tail")
+    ]
     got = np.concatenate(found)
     lost = 1 if layout.totals else 0  # the first total only gives the starting point
     for name in ("gyro", "accelerometer"):
@@ -147,7 +151,7 @@ def test_an_invented_profile_works_by_path_without_code(document: dict[str, obje
 
 def test_a_profile_tells_all_its_faults_at_once(tmp_path: Path) -> None:
     document = stream_profile(byte_order="middle", sample_rate_hz=0, colour="red")
-    with pytest.raises(FileFaults) as caught:
+    with pytest.raises(FaultyFileError) as caught:
         profiles.load(written(tmp_path, document))
     told = " ".join(caught.value.faults)
     assert all(place in told for place in ("byte_order", "sample_rate_hz", "colour"))
@@ -163,14 +167,21 @@ def test_a_profile_tells_all_its_faults_at_once(tmp_path: Path) -> None:
         ({"messages": [message(3, "i24", "i8", None)]}, "unsigned"),
         ({"sample_rate_hz": 300}, "whole nanoseconds"),
         ({"messages": [message(3, "i24", "u8", {"kind": "crc", "width": 16})]}, "polynomial"),
-        ({"messages": [message(3, "i24", "u8", {"kind": "sum", "width": 8, "offset": 5, "first": 0, "last": 9})]}, "inside"),
+        (
+            {
+                "messages": [
+                    message(3, "i24", "u8", {"kind": "sum", "width": 8, "offset": 5, "first": 0, "last": 9})
+                ]
+            },
+            "inside",
+        ),
         ({"status_bits": [{"bit": 1, "name": "a", "means": "fault"}] * 2}, "each bit once"),
     ],
 )
 def test_a_profile_that_makes_no_sense_is_refused_with_the_reason(
     change: dict[str, object], said: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(FileFaults, match=said):
+    with pytest.raises(FaultyFileError, match=said):
         profiles.load(written(tmp_path, stream_profile(**change)))
 
 

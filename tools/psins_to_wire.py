@@ -40,10 +40,14 @@ def read(path: Path) -> Records:
         No such file, or not such a file.
     """
     try:
-        lines = [line for line in path.read_text("ascii").splitlines() if line.strip() and not line.startswith("%")]
+        lines = [
+            line for line in path.read_text("ascii").splitlines() if line.strip() and not line.startswith("%")
+        ]
         rows = np.loadtxt(lines[_INITIAL_ROWS:], np.int64, ndmin=2)
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: expected a PSINS log of six integers a row, cannot read it: {error}") from error
+        raise InputError(
+            f"{path}: expected a PSINS log of six integers a row, cannot read it: {error}"
+        ) from error
     if rows.ndim != 2 or rows.shape[1] != 6:
         raise InputError(f"{path}: expected six integers a row, got an array of shape {rows.shape}")
     pulses = np.zeros(len(rows), PULSES)

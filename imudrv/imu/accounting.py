@@ -80,6 +80,16 @@ class Account:
         """Samples that the unit numbered and that were not handed on."""
         return self.damaged + self.torn + self.missing + self.late
 
+    def __str__(self) -> str:
+        """The books in one line."""
+        others = ("base", "damaged", "torn", "missing", "late")
+        where = "".join(f" + {count} {name}" for name in others if (count := getattr(self, name)))
+        bridged = f"; {self.bridged} of the lost bridged by running totals" if self.bridged else ""
+        return (
+            f"{self.expected} samples by the counter = {self.good} good{where}"
+            f"; {self.duplicate} duplicate, {self.restarts} restarts of the unit{bridged}"
+        )
+
 
 class Accountant:
     """Counter and loss accounting of one unit.

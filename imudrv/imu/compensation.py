@@ -288,11 +288,25 @@ def _move(out, filled, m, interval_ns, taps, lag, history, rate, state):  # type
     parts, slot, head_end, rate_known = state[0], state[1], state[2], state[3] != 0
     x0, x1, x2 = rate[0], rate[1], rate[2]
     length = taps.shape[0]
-    for i in range(filled, out.shape[0]):
+    i = filled
+    single = 0  # rows of one interval each, unbroken, that stand in `out` right before row i
+    while i < out.shape[0]:
+        if single >= length and rate_known:
+            first = i
+            i, x0, x1, x2 = _move_steadily(out, i, m, interval_ns, taps, lag, x0, x1, x2)
+            for k in range(max(first, i - length), i):
+                part = out[k]
+                d0, d1, d2 = part["dtheta_b"][0], part["dtheta_b"][1], part["dtheta_b"][2]
+                slot = _remember(history, slot, d0, d1, d2)
+            parts += i - first
+            ready += i - first
+            head_end = parts - lag + 1
+            single = 0
+            continue
         row = out[i]
         if row["flags"] & _MISSING_BEFORE:
             _finish_all(out[ready:i], m)
-            ready, parts, rate_known = i, 0, False
+            ready, parts, rate_known, single = i, 0, False, 0
         steps = 1 if row["interval_ns"] == interval_ns else row["interval_ns"] // interval_ns
         d0, d1, d2 = row["dtheta_b"][0], row["dtheta_b"][1], row["dtheta_b"][2]
         if steps > 1:
@@ -300,10 +314,7 @@ def _move(out, filled, m, interval_ns, taps, lag, history, rate, state):  # type
         if ready == i:
             head_end = parts + steps
         for _ in range(steps):
-            # Kept twice, so that the latest ones always stand in a row.
-            for at in (slot, slot + length):
-                history[at, 0], history[at, 1], history[at, 2] = d0, d1, d2
-            slot = slot + 1 if slot + 1 < length else 0
+            slot = _remember(history, slot, d0, d1, d2)
             parts += 1
             if ready > i or head_end != parts - lag:
                 continue
@@ -325,9 +336,50 @@ def _move(out, filled, m, interval_ns, taps, lag, history, rate, state):  # type
             if ready <= i:
                 after = out[ready]["interval_ns"]
                 head_end += 1 if after == interval_ns else after // interval_ns
+        single = single + 1 if steps == 1 else 0
+        i += 1
     state[0], state[1], state[2], state[3] = parts, slot, head_end, rate_known
     rate[0], rate[1], rate[2] = x0, x1, x2
     return ready
+
+
+@kernel
+def _move_steadily(out, i, m, interval_ns, taps, lag, x0, x1, x2):  # type: ignore[no-untyped-def]
+    """Finish rows while rows of one interval each come unbroken: the same bits as `_move`, in half the time.
+
+    The rows that the filter needs all stand in `out`. Gives the first row that is not so, and the rate at the
+    end of the last one that was finished.
+    """
+    length = taps.shape[0]
+    T = interval_ns * NS
+    while i < out.shape[0]:
+        row = out[np.uint64(i)]
+        if row["interval_ns"] != interval_ns or row["flags"] & _MISSING_BEFORE:
+            break
+        y0 = y1 = y2 = 0.0
+        for j in range(length):
+            part, h = out[np.uint64(i + 1 - length + j)], taps[np.uint64(j)]
+            y0 += h * part["dtheta_b"][0]
+            y1 += h * part["dtheta_b"][1]
+            y2 += h * part["dtheta_b"][2]
+        head = out[np.uint64(i - lag)]
+        head["flags"] |= _SIZE_EFFECT
+        m0, m1, m2 = head["dtheta_b"][0], head["dtheta_b"][1], head["dtheta_b"][2]
+        e0, e1, e2 = _size_effect(m, T, x0, x1, x2, m0, m1, m2, y0, y1, y2)
+        _finish(head, m, e0, e1, e2)
+        x0, x1, x2 = y0, y1, y2
+        i += 1
+    return i, x0, x1, x2
+
+
+@kernel
+def _remember(history, slot, d0, d1, d2):  # type: ignore[no-untyped-def]
+    """Put an angle in the place of the oldest one; the next place."""
+    length = history.shape[0] // 2
+    # Kept twice, so that the latest ones always stand in a row.
+    for at in (slot, slot + length):
+        history[at, 0], history[at, 1], history[at, 2] = d0, d1, d2
+    return slot + 1 if slot + 1 < length else 0
 
 
 @kernel

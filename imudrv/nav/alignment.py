@@ -127,6 +127,8 @@ class Aligned:
 class Alignment:
     """Alignment of a unit at rest; feed it in any pieces, the result is the same bits.
 
+    Time for which there are no increments does not count.
+
     Parameters
     ----------
     latitude_rad : float
@@ -370,7 +372,7 @@ def _noise(v: Array, dt: Array, gravity: float) -> _Noise:
 
 
 def _filtered(v: Array, dt: Array, gravity: float, noise: _Noise) -> tuple[Array, Array, Array]:
-    """Tilts about east and north at the end, their rates, and either's covariance with velocity before them."""
+    """Tilts about east and north at the end, their rates, and the covariance of (velocity, tilt, rate)."""
     measured = np.stack(
         [v[:, 1], -v[:, 0]], axis=1
     )  # the velocities that tilts about east and north drive by +g

@@ -18,18 +18,19 @@ Rate and specific force are taken as linear in time over both:
 Sources: Savage, Strapdown Inertial Navigation Integration Algorithm Design, Journal of Guidance, Control, and
 Dynamics 21 (1998), part 1 (attitude), 19-28, and part 2 (velocity and position), 208-221; Titterton and
 Weston, Strapdown Inertial Navigation Technology, 2nd ed., chapters 3 and 11. k for unequal intervals follows
-from the same model: for omega = w0 + w1 t coning is (w0 x w1) T^3 / 12, and dtheta1 x dtheta is (w0 x w1) T
-T1 (T + T1) / 2. Left out: terms in zeta^2 (8e-14 m/s^2 at 1 ms) and the way of the Earth's terms within an
-interval.
+from the same model: for `omega = w0 + w1 t` coning is `w0 x w1 T^3 / 12`, and `dtheta1 x dtheta` is
+`w0 x w1 T T1 (T + T1) / 2`. Left out: terms in zeta^2 (8e-14 m/s^2 at 1 ms) and that the Earth's terms change
+within an interval.
 
 **The measurement matrices** say how the navigated velocity answers to what is left in the increments
 (mathematics, sections 2 and 4). All of it is measured minus true, to first order:
 
     delta v_n = H R + B b + f_n x (phi_0 t - Q vec(dG))        phi = phi_0 - P vec(dG)
 
-    H (3, 9)  R: sensing points (r_x, r_y, r_z) that were not compensated, m B (3, 3)  b: bias left in the
-    specific force, body axes, m/s^2; the integral of C_nb P (3, 9)  dG by rows: scale and misalignment, `dG @
-    omega_ib_b` too much rate; the integral of C_nb kron omega Q (3, 9)  the integral of P
+    H (3, 9)  R: sensing points (r_x, r_y, r_z) that were not compensated, m
+    B (3, 3)  b: bias left in the specific force, body axes, m/s^2; the integral of C_nb
+    P (3, 9)  dG by rows: scale and misalignment, `dG @ omega_ib_b` too much rate; integral of C_nb kron omega
+    Q (3, 9)  the integral of P
 
 A size effect also acts back through Coriolis' acceleration (1.5e-3 of it in 10 s), so that
 

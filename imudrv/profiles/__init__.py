@@ -33,7 +33,12 @@ class Number(Model):
     type: NumberType
     offset: Offset
     axis: Literal["x", "y", "z"] | None = None
-    sensor: Literal["gyro", "accelerometer", "accelerometer_x", "accelerometer_y", "accelerometer_z", "electronics"] | None = None
+    sensor: (
+        Literal[
+            "gyro", "accelerometer", "accelerometer_x", "accelerometer_y", "accelerometer_z", "electronics"
+        ]
+        | None
+    ) = None
     degc_per_count: Annotated[float, Key(gt=0)] = 1.0
     degc_at_zero: float = 0.0
 
@@ -102,10 +107,15 @@ class Message(Model):
             spans.append((0, len(bytes.fromhex(self.sync)), "sync"))
         if self.check is not None:
             spans.append((self.check.offset, self.check.width // 8, "check"))
-            if self.check.first <= self.check.offset + self.check.width // 8 - 1 and self.check.offset <= self.check.last:
+            if (
+                self.check.first <= self.check.offset + self.check.width // 8 - 1
+                and self.check.offset <= self.check.last
+            ):
                 raise ValueError("expected a check outside of the bytes it covers, got one inside")
             if self.check.last >= self.length:
-                raise ValueError(f"expected a check of bytes 0..{self.length - 1}, got last: {self.check.last}")
+                raise ValueError(
+                    f"expected a check of bytes 0..{self.length - 1}, got last: {self.check.last}"
+                )
         end, before = 0, ""
         for offset, size, what in sorted(spans):
             if offset < end:
@@ -200,7 +210,9 @@ class Profile(Model):
             if message.sync is not None:
                 faults.append(f"messages[{i}].sync: expected none in a CAN profile")
             if message.length > longest or message.length not in _CAN_FD_LENGTHS:
-                faults.append(f"messages[{i}].length: expected a CAN data length up to {longest}, got {message.length}")
+                faults.append(
+                    f"messages[{i}].length: expected a CAN data length up to {longest}, got {message.length}"
+                )
         if len({m.id for m in self.messages}) < len(self.messages):
             faults.append("messages: expected each id once, got one twice")
         return faults
@@ -212,7 +224,9 @@ class Profile(Model):
         for name in ("gyro", "accelerometer"):
             axes = sorted(n.axis or "" for n in always if n.name == name)
             if axes != list(_AXES):
-                faults.append(f"{name}: expected x, y and z once each in messages of every sample, got {axes}")
+                faults.append(
+                    f"{name}: expected x, y and z once each in messages of every sample, got {axes}"
+                )
         pulses = [n for n in always if n.axis]
         if len({n.bits for n in pulses}) > 1 and self.counts == "total":
             faults.append("fields: expected pulse totals of one width, got several")
@@ -242,7 +256,7 @@ class Profile(Model):
         """The form that the decoder and the encoder read."""
         temperatures = [n for m in self.messages for n in m.fields if n.name == "temperature"]
         numbers = [n for m in self.messages for n in m.fields]
-        names = [n.sensor or "" for n in temperatures]
+        names: list[str] = [n.sensor or "" for n in temperatures]
         return wire.Layout(
             name=self.name,
             can=self.transport == "can",
@@ -303,7 +317,9 @@ def _check(check: Check | None) -> wire.Check:
 
 def shipped() -> list[str]:
     """Names of the profiles that come with the package."""
-    return sorted(p.name.removesuffix(".yaml") for p in resources.files(__name__).iterdir() if p.name.endswith(".yaml"))
+    return sorted(
+        p.name.removesuffix(".yaml") for p in resources.files(__name__).iterdir() if p.name.endswith(".yaml")
+    )
 
 
 def load(name_or_path: str) -> Profile:
@@ -329,7 +345,7 @@ def load(name_or_path: str) -> Profile:
             return read(path, Profile)
     if not Path(name_or_path).exists():
         raise InputError(
-            f"profile {name_or_path!r}: expected one of {', '.join(shipped())}, or the path of a profile file; "
-            "there is no such file"
+            f"profile {name_or_path!r}: expected one of {', '.join(shipped())}, "
+            "or the path of a profile file; there is no such file"
         )
     return read(name_or_path, Profile)

@@ -1,7 +1,7 @@
 """Pulses and increments into files: `.csv`, `.npz`, and `.i50n` datagrams; the suffix says which.
 
-A file appears whole under its name or not at all: it is written beside it and renamed at the end. All three are
-written as the data comes, so that a capture of any length needs little memory.
+A file appears whole under its name or not at all: it is written beside it and renamed at the end. All three
+are written as the data comes, so that a capture of any length needs little memory.
 """
 
 import os
@@ -143,7 +143,7 @@ class NpzTable:
         """Append rows."""
         for name, column in columns.items():
             if name not in self._columns:
-                grown = self._open.enter_context(TemporaryFile(dir=self._folder))
+                grown = self._open.enter_context(TemporaryFile(dir=self._folder))  # noqa: SIM115
                 self._columns[name] = (grown, column.dtype, column.shape[1:])
             self._columns[name][0].write(np.ascontiguousarray(column).tobytes())
         self._rows += len(next(iter(columns.values())))
@@ -209,7 +209,9 @@ def table(path: Path, kinds: Sequence[str], parts: Mapping[str, Sequence[str]]) 
         Another suffix, or a folder that cannot be written to.
     """
     if path.suffix not in kinds:
-        raise InputError(f"{path}: expected a name ending in {', '.join(kinds)}, got {path.suffix or 'no suffix'}")
+        raise InputError(
+            f"{path}: expected a name ending in {', '.join(kinds)}, got {path.suffix or 'no suffix'}"
+        )
     with replacing(path) as file:
         rows: Table
         if path.suffix == ".csv":

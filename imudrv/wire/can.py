@@ -10,6 +10,7 @@ from imudrv.records import FRAME, MAX_TEMPERATURES, NO_TEMPERATURE, REJECT, Reas
 from imudrv.wire.fields import SLACK, check_holds, fill, read
 from imudrv.wire.layout import COUNTER, Layout
 from imudrv.wire.stream import Decoded
+from imudrv.wire.tables import message_tables
 
 OPEN_SAMPLES: Final = 4
 """Incomplete samples kept at a time: the order of ids may interleave neighbours."""
@@ -168,7 +169,7 @@ def _tables(layout: Layout) -> _Tables:
         constant += len(kind.constants)
         hold = max(hold, 2 * kind.every * is_full)
     rows.append((-1, 0, 0, 0, 0, field, constant))
-    tables = [layout.tables(kind) for kind in kinds]
+    tables = [message_tables(layout, kind) for kind in kinds]
     return _Tables(
         np.array(rows, np.int64),
         layout.big_endian,

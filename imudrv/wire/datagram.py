@@ -1,4 +1,4 @@
-"""The output datagram `I50N`, version 1: 76 bytes a sample, several back to back in one packet (ICD, section 7)."""
+"""The output datagram `I50N`, version 1: 76 bytes a sample, one or more in a packet (ICD, section 7)."""
 
 import zlib
 from enum import IntEnum
@@ -62,7 +62,7 @@ def encode(increments: Records, source: Source) -> bytes:
     rows["source"] = source
     for name in _SAME:
         rows[name] = increments[name]
-    data = memoryview(rows.view(np.uint8))
+    data = rows.tobytes()
     rows["crc"] = [zlib.crc32(data[at : at + _CHECKED]) for at in range(0, len(data), SIZE)]
     return rows.tobytes()
 

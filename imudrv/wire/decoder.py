@@ -1,4 +1,4 @@
-"""The decoder of a recorded capture: the stages that its profile needs, and a tally of what was not a frame."""
+"""The decoder of a recorded capture: the stages that its profile needs, and a tally of what is no frame."""
 
 from dataclasses import dataclass, field
 from typing import Final
@@ -61,7 +61,8 @@ class CaptureDecoder:
         """
         if self._stream is not None:
             return self._keep(self._stream.feed(data))
-        assert self._log is not None and self._messages is not None
+        assert self._log is not None
+        assert self._messages is not None
         messages, rejects = self._log.feed(data)
         self._tally(rejects)
         return self._keep(self._messages.feed(messages))
@@ -76,7 +77,8 @@ class CaptureDecoder:
         """
         if self._stream is not None:
             return self._keep(self._stream.close())
-        assert self._log is not None and self._messages is not None
+        assert self._log is not None
+        assert self._messages is not None
         messages, rejects = self._log.close()
         self._tally(rejects)
         last = self._keep(self._messages.feed(messages))

@@ -10,6 +10,7 @@ from imudrv.kernels import kernel
 from imudrv.records import MAX_TEMPERATURES, MESSAGE, Records
 from imudrv.wire.check import KIND, OFFSET, WIDTH, compute
 from imudrv.wire.layout import ACCELEROMETER, COUNTER, GYRO, STATUS, TEMPERATURE, Field, Layout, Message
+from imudrv.wire.tables import message_tables
 
 _TARGETS: Final = TEMPERATURE + MAX_TEMPERATURES
 _PULSES: Final = slice(GYRO, STATUS)
@@ -164,7 +165,7 @@ def _encode(numbers: NDArray[np.int64], layout: Layout, message: Message) -> NDA
     rows = np.zeros((len(numbers), message.length), np.uint8)
     for offset, value in message.constants:
         rows[:, offset] = value
-    _fill_rows(rows, numbers, layout.tables(message))
+    _fill_rows(rows, numbers, message_tables(layout, message))
     return rows
 
 

@@ -1,11 +1,8 @@
-"""How the messages of one profile look: the form of a profile that the kernels read."""
+"""How the messages of one profile look: all that decoding and encoding need to know."""
 
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final, NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
 
 COUNTER: Final = 0
 GYRO: Final = 1
@@ -107,23 +104,15 @@ class Message(NamedTuple):
         return any(field.target == target for field in self.fields)
 
 
-class Tables(NamedTuple):
-    """One message as arrays, for the kernels; see `imudrv.wire.fields` and `imudrv.wire.check`."""
-
-    length: int
-    big_endian: bool
-    constants: NDArray[np.int64]
-    fields: NDArray[np.int64]
-    check: NDArray[np.int64]
-    crc_table: NDArray[np.uint32]
-
-
 class StatusMasks(NamedTuple):
     """Which bits of the status word mean what for the driver."""
 
     fault: int = 0
     saturated: int = 0
     warm_up: int = 0
+
+
+_NO_MASKS: Final = StatusMasks()
 
 
 @dataclass(frozen=True)
@@ -170,27 +159,10 @@ class Layout:
     temperature_names: tuple[str, ...] = ()
     degc_per_count: tuple[float, ...] = ()
     degc_at_zero: tuple[float, ...] = ()
-    status: StatusMasks = StatusMasks()
+    status: StatusMasks = _NO_MASKS
     status_names: tuple[tuple[int, str], ...] = ()
 
     @property
     def pulse_limit(self) -> int:
         """Largest pulse increment of one interval that the wire can carry."""
         return (1 << (self.pulse_bits - 1)) - 1
-
-    def tables(self, message: Message) -> Tables:
-        """The arrays that the kernels read of `message`."""
-        from imudrv.wire.check import crc_table, start_value
-
-        check = message.check
-        return Tables(
-            message.length,
-            self.big_endian,
-            np.array(message.constants, np.int64).reshape(-1, 2),
-            np.array(message.fields, np.int64).reshape(-1, 4),
-            np.array(
-                [check.kind, check.width, check.start, check.stop, check.offset, start_value(check), check.xor_out],
-                np.int64,
-            ),
-            crc_table(check),
-        )

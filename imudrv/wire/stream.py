@@ -9,6 +9,7 @@ from imudrv.kernels import kernel
 from imudrv.records import FRAME, REJECT, Reason, Records
 from imudrv.wire.fields import SLACK, check_holds, fill
 from imudrv.wire.layout import Layout
+from imudrv.wire.tables import message_tables
 
 _NO_SYNC: Final = int(Reason.NO_SYNC)
 _CHECK_FAILED: Final = int(Reason.CHECK_FAILED)
@@ -46,7 +47,8 @@ class StreamDecoder:
 
     def __init__(self, layout: Layout) -> None:
         (message,) = layout.messages
-        self._tables = tuple(layout.tables(message))  # plain: a named tuple reaches a kernel 1 us later
+        # A plain tuple: a named one reaches a kernel 1 us later.
+        self._tables = tuple(message_tables(layout, message))
         self._length = message.length
         self._buffer: NDArray[np.uint8] = np.zeros(message.length + SLACK, np.uint8)
         self._pending = 0

@@ -6,7 +6,7 @@ import pytest
 
 from imudrv.calibration import Calibration
 from imudrv.config import write
-from imudrv.errors import FileFaults, InputError
+from imudrv.errors import FaultyFileError, InputError
 from imudrv.sim.scenario import NOMINAL, Scenario, load, shipped
 from imudrv.sim.unit import simulate
 
@@ -106,11 +106,11 @@ def test_a_missing_calibration_file_is_named(tmp_path: Path) -> None:
 def test_nonsense_is_refused_with_its_place(
     scenario: Make, motion: dict[str, Any], sections: dict[str, Any], message: str
 ) -> None:
-    with pytest.raises(FileFaults, match=message):
+    with pytest.raises(FaultyFileError, match=message):
         scenario(motion, **sections)
 
 
 def test_two_calibrations_are_one_too_many(scenario: Make) -> None:
     inline = NOMINAL.model_dump(mode="json", exclude_none=True)
-    with pytest.raises(FileFaults, match="expected calibration_file or calibration, got both"):
+    with pytest.raises(FaultyFileError, match="expected calibration_file or calibration, got both"):
         scenario({"rest": {"duration_s": 1.0}}, unit={"calibration": inline, "calibration_file": "a.yaml"})

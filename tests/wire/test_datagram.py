@@ -1,5 +1,7 @@
 """The output datagram, both directions."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,8 +12,9 @@ from imudrv.wire.datagram import SIZE, DatagramDecoder, Source, encode
 
 # ICD, section 7.
 WORKED = bytes.fromhex(
-    "49 35 30 4e 01 02 41 00 40 e2 01 00 40 42 0f 00 15 cd 85 3d fe 9c 97 17 8d ed b5 a0 f7 c6 b0 3e 8d ed b5 a0 f7 c6 c0 be"
-    "54 e4 10 71 73 2a c9 3e 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 6e a3 01 bc 05 12 84 3f f2 8a 07 dd"
+    "49 35 30 4e 01 02 41 00 40 e2 01 00 40 42 0f 00 15 cd 85 3d fe 9c 97 17"
+    "8d ed b5 a0 f7 c6 b0 3e 8d ed b5 a0 f7 c6 c0 be 54 e4 10 71 73 2a c9 3e"
+    "00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 6e a3 01 bc 05 12 84 3f f2 8a 07 dd"
 )
 
 
@@ -58,7 +61,7 @@ def test_damage_costs_the_datagrams_it_hits_whatever_the_pieces(
     hit = {at // SIZE for at in flips}
     decoder = DatagramDecoder()
     edges = [0, *sorted(cuts), len(wire)]
-    pieces = [decoder.feed(bytes(wire[a:b])) for a, b in zip(edges, edges[1:], strict=False)]
+    pieces = [decoder.feed(bytes(wire[a:b])) for a, b in pairwise(edges)]
     got = np.concatenate([p.increments for p in pieces])
     assert got["counter"].tolist() == [k for k in range(7) if k not in hit]
 
