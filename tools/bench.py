@@ -83,7 +83,7 @@ def capture(samples: int) -> list[bytes]:
     random = np.random.default_rng(1)
     encoder = StreamEncoder(LAYOUT)
     header = bytes(value for _, value in LAYOUT.messages[0].constants)
-    line = StreamFaults(Faults(stream=DAMAGE), header, seed=2)
+    line = StreamFaults(Faults(stream=DAMAGE), header, seed=3)
     pieces = []
     for first in range(0, samples, PIECE):
         pulses = np.zeros(min(PIECE, samples - first), PULSES)
@@ -122,7 +122,7 @@ def plain_decode(data: bytes) -> list[tuple[int, ...]]:
 
 
 def plain_account(frames: Records) -> tuple[Records, int]:
-    """Pulses and number of lost samples; blind to late and doubled frames and to restarts."""
+    """Pulses and number of lost samples; blind to late, doubled and stray frames and to restarts."""
     steps = np.diff(frames["counter"], prepend=frames["counter"][0] - 1) % 2**32
     status = LAYOUT.status
     fault = frames["status"] & status.fault != 0

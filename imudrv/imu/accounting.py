@@ -1,12 +1,16 @@
 """From frames to pulse increments, with every sample that the unit numbered in exactly one place.
 
-By the counter:  expected = good + base + damaged + torn + missing + late
-By arrival:      frames   = good + base + late + duplicate
+    by the counter:  expected = good + base + damaged + torn + missing + late
+    by arrival:      frames   = good + base + late + duplicate + stray
 
 `expected` counts the numbers from the first to the last of each run of the unit's counter. A lost number is
 *torn* when half of its CAN messages came, *damaged* when bytes came in its place, *missing* when nothing did.
 A number that comes after a later one is *late*, a second time *duplicate*; neither is handed on, because
 increments go forward only. *Base* is a frame that only gives running totals their starting point.
+
+One damaged frame in 65 536 passes a CRC of 16 bits with any number in its counter. So a frame that leaps, as
+after a restart of the unit or a long silence, waits until the next one agrees; if that goes on from before
+the leap instead, the frame is *stray* and counts as bytes that were damaged.
 """
 
 from dataclasses import dataclass
@@ -15,11 +19,13 @@ from typing import Final
 import numpy as np
 
 from imudrv.kernels import kernel
-from imudrv.records import MAX_TEMPERATURES, NO_TEMPERATURE, PULSES, Flag, Records
+from imudrv.records import FRAME, MAX_TEMPERATURES, NO_TEMPERATURE, PULSES, Flag, Records
+from imudrv.wire.fields import ahead_of
 from imudrv.wire.layout import Layout
 
 WINDOW: Final = 64
-"""How far behind the newest a counter may come and still be late or duplicate; farther is a restart."""
+"""How far behind the newest a counter may come and still be late or duplicate, and how far before it without
+being a leap. A leap backward is a restart."""
 
 MAX_INTERVAL_NS: Final = 2**32 - 1
 """Longest interval that the output datagram can carry; a longer gap in running totals begins anew."""
@@ -30,6 +36,7 @@ _BUCKETS: Final = (
     "base",
     "duplicate",
     "late",
+    "stray",
     "damaged",
     "torn",
     "missing",
@@ -37,12 +44,12 @@ _BUCKETS: Final = (
     "restarts",
     "bridged",
 )
-_FRAMES, _GOOD, _BASE, _DUPLICATE, _LATE, _DAMAGED, _TORN, _MISSING, _EXPECTED, _RESTARTS, _BRIDGED = range(
-    len(_BUCKETS)
-)
+_FRAMES, _GOOD, _BASE, _DUPLICATE, _LATE, _STRAY = range(6)
+_DAMAGED, _TORN, _MISSING, _EXPECTED, _RESTARTS, _BRIDGED = range(6, len(_BUCKETS))
 _STARTED, _LAST, _FIRST, _SEEN, _ELAPSED, _HAVE_TOTALS, _LOST_BEFORE = range(7)
-_TOTALS, _PREVIOUS = 7, 13  # six each
-_STATE_SIZE: Final = 19
+_STRAY_DAMAGED, _STRAY_TORN = 7, 8  # since the newest number
+_TOTALS, _PREVIOUS = 9, 15  # six each
+_STATE_SIZE: Final = 21
 _MISSING_BEFORE: Final = int(Flag.MISSING_BEFORE)
 _LONG_INTERVAL: Final = int(Flag.LONG_INTERVAL)
 _SATURATED: Final = int(Flag.SATURATED)
@@ -60,6 +67,7 @@ class Account:
     base: int
     duplicate: int
     late: int
+    stray: int
     damaged: int
     torn: int
     missing: int
@@ -72,7 +80,7 @@ class Account:
     def closes(self) -> bool:
         """Whether both sums of the module's text hold."""
         by_counter = self.good + self.base + self.damaged + self.torn + self.missing + self.late
-        by_arrival = self.good + self.base + self.late + self.duplicate
+        by_arrival = self.good + self.base + self.late + self.duplicate + self.stray
         return by_counter == self.expected and by_arrival == self.frames
 
     @property
@@ -85,9 +93,10 @@ class Account:
         others = ("base", "damaged", "torn", "missing", "late")
         where = "".join(f" + {count} {name}" for name in others if (count := getattr(self, name)))
         bridged = f"; {self.bridged} of the lost bridged by running totals" if self.bridged else ""
+        stray = f", {self.stray} stray" if self.stray else ""
         return (
             f"{self.expected} samples by the counter = {self.good} good{where}"
-            f"; {self.duplicate} duplicate, {self.restarts} restarts of the unit{bridged}"
+            f"; {self.duplicate} duplicate{stray}, {self.restarts} restarts of the unit{bridged}"
         )
 
 
@@ -104,6 +113,7 @@ class Accountant:
         self._layout = layout
         self._state = np.zeros(_STATE_SIZE, np.int64)
         self._buckets = np.zeros(len(_BUCKETS), np.int64)
+        self._waiting = np.zeros(0, FRAME)
         self._masks = np.array(layout.status, np.int64)
         self._degc = np.full((2, MAX_TEMPERATURES), np.nan)
         known = len(layout.temperature_names)
@@ -113,7 +123,9 @@ class Accountant:
     @property
     def account(self) -> Account:
         """The state of the books."""
-        return Account(*(int(b) for b in self._buckets))
+        buckets = self._buckets.copy()
+        buckets[[_FRAMES, _STRAY]] += self._waiting.size
+        return Account(*buckets.tolist())
 
     def feed(self, frames: Records) -> Records:
         """Account for frames and hand on their pulses.
@@ -128,9 +140,11 @@ class Accountant:
         ndarray of PULSES
             One a good frame.
         """
+        if self._waiting.size:
+            frames = np.concatenate([self._waiting, frames])
         pulses = np.zeros(len(frames), PULSES)
         layout = self._layout
-        count = _account(
+        count, waits = _account(
             frames,
             pulses,
             self._state,
@@ -142,20 +156,35 @@ class Accountant:
             self._masks,
             self._degc,
         )
+        self._waiting = frames[len(frames) - waits :].copy()
         return pulses[:count]
 
 
 @kernel
-def _account(frames, pulses, state, buckets, interval_ns, counter_bits, pulse_bits, totals, masks, degc):  # type: ignore[no-untyped-def]
+def _account(  # type: ignore[no-untyped-def]
+    frames, pulses, state, buckets, interval_ns, counter_bits, pulse_bits, totals, masks, degc
+):
+    """Account for frames; how many are handed on, and whether the last one waits for the next to agree."""
     count = 0
     for i in range(frames.shape[0]):
         frame = frames[i]
+        ahead = ahead_of(frame["counter"], state[_LAST], counter_bits)
+        if state[_STARTED] != 0 and (ahead <= -WINDOW or ahead > WINDOW):
+            if i + 1 == frames.shape[0]:
+                return count, 1
+            if abs(ahead_of(frames[i + 1]["counter"], frame["counter"], counter_bits)) > WINDOW:
+                buckets[_FRAMES] += 1
+                buckets[_STRAY] += 1
+                state[_STRAY_DAMAGED] += frame["damaged"] + 1
+                state[_STRAY_TORN] += frame["torn"]
+                continue
+        buckets[_FRAMES] += 1
         lost_before = state[_LOST_BEFORE]
-        steps = _place(frame, state, buckets, counter_bits)
+        steps = _place(frame, ahead, state, buckets)
         if steps == 0:
             continue
-        state[_ELAPSED] += steps * interval_ns
         out = pulses[count]
+        state[_ELAPSED] += steps * interval_ns
         if totals:
             long = steps * interval_ns
             known = state[_HAVE_TOTALS] != 0 and long <= MAX_INTERVAL_NS
@@ -204,17 +233,12 @@ def _account(frames, pulses, state, buckets, interval_ns, counter_bits, pulse_bi
             out["flags"] |= _VALID
         buckets[_GOOD] += 1
         count += 1
-    return count
+    return count, 0
 
 
 @kernel
-def _place(frame, state, buckets, counter_bits):  # type: ignore[no-untyped-def]
-    """Put the frame's number in its bucket; intervals since the last one, 0 for a frame not handed on."""
-    buckets[_FRAMES] += 1
-    span = np.int64(1) << counter_bits
-    ahead = (frame["counter"] - state[_LAST]) & (span - 1)
-    if ahead >= span >> 1:
-        ahead -= span
+def _place(frame, ahead, state, buckets):  # type: ignore[no-untyped-def]
+    """Put a number `ahead` of the newest in its bucket; intervals from that, 0 for a frame not handed on."""
     if state[_STARTED] == 0 or ahead <= -WINDOW:
         if state[_STARTED] != 0:
             buckets[_RESTARTS] += 1
@@ -226,16 +250,17 @@ def _place(frame, state, buckets, counter_bits):  # type: ignore[no-untyped-def]
         buckets[_EXPECTED] += 1
         return 1
     if ahead > 0:
-        gap = ahead - 1
-        torn = min(gap, np.int64(frame["torn"]))
-        damaged = min(gap - torn, np.int64(frame["damaged"]))
-        buckets[_TORN] += torn
-        buckets[_DAMAGED] += damaged
-        buckets[_MISSING] += gap - torn - damaged
         buckets[_EXPECTED] += ahead
         state[_LAST] += ahead
         state[_SEEN] = (state[_SEEN] << ahead | 1) if ahead < WINDOW else 1
-        if gap > 0:
+        if ahead > 1:
+            gap = ahead - 1
+            torn = min(gap, np.int64(frame["torn"]) + state[_STRAY_TORN])
+            damaged = min(gap - torn, np.int64(frame["damaged"]) + state[_STRAY_DAMAGED])
+            buckets[_TORN] += torn
+            buckets[_DAMAGED] += damaged
+            buckets[_MISSING] += gap - torn - damaged
+            state[_STRAY_DAMAGED] = state[_STRAY_TORN] = 0
             state[_LOST_BEFORE] = 1
         return ahead
     mark = np.int64(1) << -ahead

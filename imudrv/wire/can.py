@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from imudrv.kernels import kernel
 from imudrv.records import FRAME, MAX_TEMPERATURES, NO_TEMPERATURE, REJECT, Reason, Records
-from imudrv.wire.fields import SLACK, check_holds, fill, read
+from imudrv.wire.fields import SLACK, ahead_of, check_holds, fill, read
 from imudrv.wire.layout import COUNTER, Layout
 from imudrv.wire.stream import Decoded
 from imudrv.wire.tables import message_tables
@@ -228,7 +228,7 @@ def _assemble(messages, tables, slots, latest, state, frames, found, rejects):  
 
         low = read(data, kind[_COUNTER_AT], low_bits, False, big_endian)
         if state[_HAS_SAMPLE]:
-            ahead = _ahead(low, state[_COUNTER], low_bits)
+            ahead = ahead_of(low, state[_COUNTER], low_bits)
             if ahead < -LATE:
                 for s in range(OPEN_SAMPLES):
                     rejected = _give_up(s, have, indices, state, rejects, rejected)
@@ -257,10 +257,10 @@ def _assemble(messages, tables, slots, latest, state, frames, found, rejects):  
 
         have[slot] = 0
         for s in range(OPEN_SAMPLES):
-            if _ahead(low_counters[s], low, low_bits) < 0:
+            if ahead_of(low_counters[s], low, low_bits) < 0:
                 rejected = _give_up(s, have, indices, state, rejects, rejected)
         if state[_HAS_SAMPLE] or state[_IS_ANCHORED]:
-            state[_COUNTER] = (state[_COUNTER] + _ahead(low, state[_COUNTER], low_bits)) & (full_span - 1)
+            state[_COUNTER] = (state[_COUNTER] + ahead_of(low, state[_COUNTER], low_bits)) & (full_span - 1)
         else:
             state[_COUNTER] = low
         state[_HAS_SAMPLE] = 1
@@ -300,7 +300,7 @@ def _anchor(state, full, low_bits, full_span):  # type: ignore[no-untyped-def]
     """Settle the counter by the full one of a recent sample; how far off it was."""
     shift = np.int64(0)
     if state[_HAS_SAMPLE]:
-        expected = state[_COUNTER] + _ahead(full, state[_COUNTER], low_bits)
+        expected = state[_COUNTER] + ahead_of(full, state[_COUNTER], low_bits)
         shift = (full - expected) & (full_span - 1)
         state[_COUNTER] = (state[_COUNTER] + shift) & (full_span - 1)
         state[_DISAGREED] += shift != 0 and state[_IS_ANCHORED]
@@ -308,12 +308,6 @@ def _anchor(state, full, low_bits, full_span):  # type: ignore[no-untyped-def]
         state[_COUNTER] = full
     state[_IS_ANCHORED] = 1
     return shift
-
-
-@kernel
-def _ahead(counter, other, bits):  # type: ignore[no-untyped-def]
-    """By how much the low `bits` of `counter` are ahead of those of `other`, as a signed number of `bits`."""
-    return (counter - other) << (64 - bits) >> (64 - bits)
 
 
 @kernel

@@ -30,6 +30,12 @@ def read(data, p, bits, signed, big_endian):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def ahead_of(counter, other, bits):  # type: ignore[no-untyped-def]
+    """By how much the low `bits` of `counter` are ahead of those of `other`, as a signed number of `bits`."""
+    return (counter - other) << (64 - bits) >> (64 - bits)
+
+
+@kernel
 def check_holds(data, p, big_endian, check, crc_table):  # type: ignore[no-untyped-def]
     """Whether the message at `p` carries the check value that its bytes give."""
     stands = read(data, p + check[OFFSET], check[WIDTH], False, big_endian)

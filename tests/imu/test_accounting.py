@@ -36,7 +36,7 @@ def run(counters: Sequence[int], layout: Layout = INCREMENTS, **columns: object)
 
 def books(account: Account) -> dict[str, int]:
     """The buckets that are not empty, without those that every run has."""
-    names = ("base", "duplicate", "late", "damaged", "torn", "missing", "restarts", "bridged")
+    names = ("base", "duplicate", "late", "stray", "damaged", "torn", "missing", "restarts", "bridged")
     return {name: getattr(account, name) for name in names if getattr(account, name)}
 
 
@@ -139,6 +139,29 @@ def test_the_window_separates_late_from_a_restart():
     assert pulses["counter"].tolist() == [1000, 936, 937]
 
 
+def test_a_frame_that_passed_its_check_by_chance_does_not_move_the_counter():
+    counters = [10, 11, 642_782_990, 14, 15]
+    pulses, account = run(counters, damaged=[0, 0, 1, 0, 0])
+    # Of 12 and 13 one was rejected before the stray frame, the other is that frame.
+    assert books(account) == {"stray": 1, "damaged": 2}
+    assert pulses["counter"].tolist() == [10, 11, 14, 15]
+    assert pulses["flags"].tolist() == [1, 1, Flag.VALID | Flag.MISSING_BEFORE, 1]
+
+
+def test_two_stray_frames_that_do_not_agree_are_both_stray():
+    _, account = run([10, 2**31, 5000, 13])
+    assert books(account) == {"stray": 2, "damaged": 2}
+
+
+def test_a_leap_is_believed_once_the_next_frame_agrees():
+    accountant = Accountant(INCREMENTS)
+    assert len(accountant.feed(frames([10, 10 + WINDOW + 1]))) == 1
+    assert accountant.account.stray == 1
+    pulses = accountant.feed(frames([10 + WINDOW + 3]))
+    assert pulses["counter"].tolist() == [75, 77]
+    assert books(accountant.account) == {"missing": WINDOW + 1}
+
+
 def test_after_a_restart_time_goes_on_and_the_break_is_flagged():
     pulses, account = run([1000, 1001, 0, 1])
     assert books(account) == {"restarts": 1}
@@ -170,9 +193,9 @@ def test_totals_bridge_a_gap_with_one_long_interval_that_holds_all_pulses():
 
 def test_a_gap_in_totals_longer_than_a_datagram_can_tell_begins_anew():
     longest = MAX_INTERVAL_NS // TAU
-    pulses, account = run([0, longest], TOTALS)
+    pulses, account = run([0, longest, longest + 1], TOTALS)
     assert books(account) == {"base": 1, "missing": longest - 1, "bridged": longest - 1}
-    assert pulses["interval_ns"].tolist() == [longest * TAU]
+    assert pulses["interval_ns"].tolist() == [longest * TAU, TAU]
 
     pulses, account = run([0, longest + 1, longest + 2], TOTALS)
     assert books(account) == {"base": 2, "missing": longest}
