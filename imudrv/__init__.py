@@ -2,12 +2,16 @@
 
 The flow, one way; every stage is a package or module that can be read alone::
 
-    bytes -> FRAME -> PULSES -> INCREMENTS -> out
-        wire      imu       imu         sinks
+    port -> bytes -> FRAME -> PULSES -> INCREMENTS -> out
+       ports     wire     imu       imu         sinks
 
+    ports  where bytes and CAN messages come from, by URL: `open_port`
     wire   decodes: `StreamDecoder`, `CandumpDecoder` + `CanAssembler`; encodes for the simulator
-    imu    accounts for every sample (`Accountant`) and compensates (`Compensator`); both pure
-    nav    strapdown mathematics      sim    the unit that is not there      captures    recorded files
+    imu    accounts for every sample (`Accountant`), stamps it (`ClockModel`), compensates it (`Compensator`)
+    sinks  where increments go, by URL, and the recorder
+    pipeline, service    the stages in a row, and the one thread that runs them live
+    captures, recording  the same from files
+    nav    strapdown mathematics      sim    the unit that is not there
 
 What flows are numpy record arrays (`imudrv.records`), time along the first axis: one row live, millions
 offline. Kernels keep their state, so that any cut into pieces gives the same bits.
@@ -27,6 +31,8 @@ from imudrv.imu.compensation import Coefficients, Compensator
 from imudrv.imu.rate_filter import rate_filter
 from imudrv.profiles import Profile
 from imudrv.profiles import load as load_profile
+from imudrv.receive import Receiver, receive
+from imudrv.recording import Recording
 from imudrv.records import FRAME, INCREMENTS, PULSES, Flag, Reason
 from imudrv.site import Site
 from imudrv.wire.datagram import DatagramDecoder, Source
@@ -50,6 +56,8 @@ __all__ = [
     "InputError",
     "Profile",
     "Reason",
+    "Receiver",
+    "Recording",
     "Site",
     "Source",
     "StreamDecoder",
@@ -57,5 +65,6 @@ __all__ = [
     "load_profile",
     "rate_filter",
     "read_calibration",
+    "receive",
     "write_calibration",
 ]

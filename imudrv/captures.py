@@ -1,4 +1,4 @@
-"""A recorded capture through the stages that live samples take: decode, account, compensate."""
+"""A capture file, or a recording, through the stages that live samples take: decode, account, compensate."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -8,10 +8,12 @@ import numpy as np
 from imudrv import profiles
 from imudrv.errors import InputError
 from imudrv.imu.accounting import Accountant
+from imudrv.imu.clock import ClockModel
 from imudrv.imu.compensation import Compensator
-from imudrv.records import Flag, Records
-from imudrv.wire.decoder import CaptureDecoder
-from imudrv.wire.layout import Layout
+from imudrv.profiles import Profile
+from imudrv.recording import Recording
+from imudrv.records import Flag, Reason, Records
+from imudrv.wire.decoder import CaptureDecoder, FrameDecoder, Rejected
 
 CHUNK_BYTES = 1 << 19
 """Read at once: small enough for the cache, large enough that Python's part does not show."""
@@ -23,21 +25,18 @@ class Capture:
     Parameters
     ----------
     path : Path
-        Wire bytes; for a CAN profile a candump log.
-    layout : Layout
-        Of its profile.
+        Wire bytes; for a CAN profile a candump log; where the name ends in ``.mcap`` a recording.
+    profile : Profile, optional
+        What the unit sends. A recording knows it.
 
     Raises
     ------
     InputError
-        There is no such file, or it is empty.
+        There is no such file, it is empty, or it is no recording and there is no profile.
     """
 
-    def __init__(self, path: Path, layout: Layout) -> None:
+    def __init__(self, path: Path, profile: Profile | None = None) -> None:
         self.path = path
-        self.layout = layout
-        self.decoder = CaptureDecoder(layout)
-        self.accountant = Accountant(layout)
         try:
             with path.open("rb") as file:
                 self._head = file.read(1 << 16)
@@ -45,7 +44,21 @@ class Capture:
         except OSError as error:
             raise InputError(f"{path}: expected a capture file, cannot read it: {error.strerror}") from error
         if not self._head:
-            raise InputError(f"{path}: expected a capture of {layout.name}, got an empty file")
+            raise InputError(f"{path}: expected a capture, got an empty file")
+        self.recording = Recording(path) if path.suffix == ".mcap" else None
+        if profile is None and self.recording is not None:
+            profile = self.recording.profile
+        if profile is None:
+            raise InputError(f"{path}: expected --profile, for only a recording knows what the unit sends")
+        self.profile = profile
+        self.layout = profile.layout()
+        self.accountant = Accountant(self.layout)
+        self._decoder = CaptureDecoder(self.layout) if self.recording is None else FrameDecoder(self.layout)
+
+    @property
+    def rejected(self) -> dict[Reason, Rejected]:
+        """What was no frame, by reason."""
+        return self._decoder.rejected
 
     def pulses(self, advance: Callable[[int], None]) -> Iterator[Records]:
         """Decode the file, piece by piece.
@@ -65,11 +78,9 @@ class Capture:
         InputError
             The whole file held no frame of the profile; says which shipped profile fits, if one does.
         """
-        with self.path.open("rb") as file:
-            while data := file.read(CHUNK_BYTES):
-                yield self.accountant.feed(self.decoder.feed(data))
-                advance(len(data))
-        yield self.accountant.feed(self.decoder.close())
+        for frames in self._frames(advance):
+            yield self.accountant.feed(frames)
+        yield self.accountant.feed(self._decoder.close())
         if self.accountant.account.frames == 0:
             raise InputError(
                 f"{self.path}: expected frames of {self.layout.name}, "
@@ -89,17 +100,38 @@ class Capture:
         Yields
         ------
         ndarray of INCREMENTS
-            In order; times count from the beginning of the capture, and are flagged as not UNIX time.
+            In order. Those of a recording bear the stamps that they had live; in a capture times count from
+            its beginning, and are flagged as not UNIX time.
         """
+        if self.recording is None:
+            for pulses in self.pulses(advance):
+                yield _unlocked(compensator.feed(pulses))
+            yield _unlocked(compensator.close())
+            return
+        clock = ClockModel(self.layout.interval_ns, self.profile.transmission_ns)
         for pulses in self.pulses(advance):
-            yield _unlocked(compensator.feed(pulses))
-        yield _unlocked(compensator.close())
+            clock.feed(pulses)
+            yield clock.stamp(compensator.feed(pulses))
+        yield clock.stamp(compensator.close())
+
+    def _frames(self, advance: Callable[[int], None]) -> Iterator[Records]:
+        if isinstance(self._decoder, CaptureDecoder):
+            with self.path.open("rb") as file:
+                while data := file.read(CHUNK_BYTES):
+                    yield self._decoder.feed(data)
+                    advance(len(data))
+            return
+        assert self.recording is not None
+        for arrival in self.recording.arrivals():
+            yield self._decoder.feed(arrival.data, arrival.t_ns)
+            advance(len(arrival.data))
 
     def _hint(self) -> str:
-        for name in profiles.shipped():
-            layout = profiles.load(name).layout()
-            if layout.name != self.layout.name and len(CaptureDecoder(layout).feed(self._head)):
-                return f"; its beginning has frames of {name}: try --profile {name}"
+        if self.recording is None:
+            for name in profiles.shipped():
+                layout = profiles.load(name).layout()
+                if layout.name != self.layout.name and len(CaptureDecoder(layout).feed(self._head)):
+                    return f"; its beginning has frames of {name}: try --profile {name}"
         return "; is it the right file, and the right --profile?"
 
 

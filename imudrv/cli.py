@@ -1,24 +1,38 @@
 """The command `imudrv`: arguments in, one function a command, plain words out."""
 
 import argparse
+import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TypeAlias
 
-from imudrv import config, profiles
+from rich.console import Console
+
+from imudrv import config, profiles, settings
 from imudrv.calibration import Calibration, coefficients, read_calibration
 from imudrv.captures import Capture
 from imudrv.config import Model
-from imudrv.console import guarded, progress
+from imudrv.console import BAD_INPUT, OK, guarded, progress
 from imudrv.demo import demo
+from imudrv.doctor import doctor
 from imudrv.errors import InputError
+from imudrv.export import KINDS, export
 from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import NAMES, rate_filter
+from imudrv.monitor import monitor
 from imudrv.profiles import Profile
+from imudrv.recording import Recording, pack
+from imudrv.service import Service
+from imudrv.settings import Settings
 from imudrv.sim import scenario as scenarios
 from imudrv.sim.capture import record
+from imudrv.sim.live import play, speed_of
 from imudrv.sim.scenario import Scenario
 from imudrv.sinks.files import increment_columns, pulse_columns, replacing, table
 from imudrv.site import Site
+from imudrv.status import EXIT_CODES, ask
+
+Command: TypeAlias = Callable[[argparse.Namespace], int | None]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -35,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit code, see `imudrv.console`.
     """
     arguments = _parser().parse_args(argv)
-    command: Callable[[argparse.Namespace], None] = arguments.command
+    command: Command = arguments.command
     return guarded(lambda: command(arguments))
 
 
@@ -43,25 +57,25 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="imudrv", description="Driver of a 50-type ring-laser-gyro IMU.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
-    def add(name: str, command: Callable[[argparse.Namespace], None], text: str) -> argparse.ArgumentParser:
+    def add(name: str, command: Command, text: str) -> argparse.ArgumentParser:
         sub = commands.add_parser(name, help=text, description=text)
         sub.set_defaults(command=command)
         return sub
 
-    def add_profile(sub: argparse.ArgumentParser) -> None:
+    def add_profile(sub: argparse.ArgumentParser, required: bool = False) -> None:
         text = f"{', '.join(profiles.shipped())}, or a profile file"
-        sub.add_argument("--profile", required=True, metavar="P", help=text)
+        sub.add_argument("--profile", required=required, metavar="P", help=text)
 
     sub = add("decode", _decode, "Capture to pulse increments.")
-    sub.add_argument("capture", type=Path, help="wire bytes; for a CAN profile a candump log")
+    sub.add_argument("capture", type=Path, help="wire bytes, a candump log, or a recording.mcap")
     add_profile(sub)
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="NAME.csv or NAME.npz")
 
     sub = add("compensate", _compensate, "Capture to compensated increments in body axes.")
-    sub.add_argument("capture", type=Path, help="wire bytes; for a CAN profile a candump log")
+    sub.add_argument("capture", type=Path, help="wire bytes, a candump log, or a recording.mcap")
     add_profile(sub)
     sub.add_argument(
-        "--calibration", type=Path, required=True, metavar="C.yaml", help="the unit's calibration file"
+        "--calibration", type=Path, metavar="C.yaml", help="the unit's; default: the recording's own"
     )
     sub.add_argument(
         "--unit", metavar="SERIAL", help="serial number of the unit; another unit's calibration is refused"
@@ -73,15 +87,63 @@ def _parser() -> argparse.ArgumentParser:
         "-o", "--output", type=Path, required=True, metavar="OUT", help="NAME.csv, NAME.npz or NAME.i50n"
     )
 
-    sub = add("sim", _sim, "A simulated unit's output as a capture.")
+    sub = add("sim", _sim, "A simulated unit: into a capture, or live as hardware in the loop.")
     sub.add_argument("scenario", help=f"{', '.join(scenarios.shipped())}, or a scenario file")
-    add_profile(sub)
-    sub.add_argument(
-        "-o", "--output", type=Path, required=True, metavar="CAPTURE", help="the capture to write"
+    add_profile(sub, required=True)
+    way = sub.add_mutually_exclusive_group(required=True)
+    way.add_argument("-o", "--output", type=Path, metavar="CAPTURE", help="the capture to write")
+    way.add_argument(
+        "--port",
+        metavar="URL",
+        help="play live on pty, serial://PATH, can://INTERFACE/CHANNEL or tcp://[HOST]:PORT",
     )
     sub.add_argument("--truth", type=Path, metavar="FILE.npz", help="what really happened, sample by sample")
+    sub.add_argument("--speed", metavar="X", help="of a live run: 1, 10, ... or max (default: 1)")
+    sub.add_argument("--link", metavar="NAME", help="stable name for the pty of a live run")
 
-    sub = add("check", _check, "Check a calibration, site, profile or scenario file.")
+    sub = add("run", _run, "The live service: unit in, navigation out.")
+    sub.add_argument("settings", type=Path, nargs="?", help="settings file; options go before it")
+    sub.add_argument(
+        "--port", metavar="URL", help="where the unit is: /dev/ttyUSB0, can://..., replay://..., sim://..."
+    )
+    sub.add_argument("--profile", metavar="P", help="wire format, as for decode")
+    sub.add_argument("--calibration", metavar="C.yaml", help="the unit's calibration file")
+    sub.add_argument("--unit", metavar="SERIAL", help="serial number of the unit that is connected")
+    sub.add_argument(
+        "--out",
+        dest="outputs",
+        action="append",
+        metavar="URL",
+        help="udp://HOST:PORT, tcp://[HOST]:PORT, serial://PATH, can://..., file:NAME; again for more",
+    )
+    sub.add_argument("--record", metavar="FILE.mcap", help="record everything; a folder: a file for each run")
+    sub.add_argument("--rate-filter", choices=NAMES, help="for the size effect (default: causal)")
+    sub.add_argument("--status", metavar="PATH", help="socket that tells the status")
+    sub.add_argument(
+        "--realtime", action="store_true", default=None, help="ask for SCHED_FIFO and locked memory"
+    )
+
+    sub = add("monitor", _monitor, "A running service, live on the terminal.")
+    sub.add_argument("--status", type=Path, metavar="PATH", help="the service's socket")
+
+    sub = add("status", _status, "A running service's health; exit code 0 ok, 3 warning, 4 failure.")
+    sub.add_argument("--status", type=Path, metavar="PATH", help="the service's socket")
+    sub.add_argument("--json", action="store_true", help="the whole status, for scripts")
+
+    sub = add("doctor", _doctor, "Find out why a unit is not heard, and what to do.")
+    sub.add_argument("--port", metavar="URL", required=True, help="as for run")
+    sub.add_argument("--profile", metavar="P", help="what the unit should send")
+
+    sub = add("pack", _pack, "Rewrite a recording compressed.")
+    sub.add_argument("recording", type=Path)
+    sub.add_argument("-o", "--output", type=Path, required=True, metavar="PACKED.mcap")
+
+    sub = add("export", _export, "A recording in another format.")
+    sub.add_argument("recording", type=Path)
+    sub.add_argument("--to", choices=KINDS, required=True, help="the format")
+    sub.add_argument("-o", "--output", type=Path, required=True, metavar="OUT")
+
+    sub = add("check", _check, "Check a calibration, site, profile, scenario or settings file.")
     sub.add_argument("file", type=Path, help="the file")
 
     add(
@@ -91,25 +153,30 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _decode(arguments: argparse.Namespace) -> None:
-    layout = profiles.load(arguments.profile).layout()
-    capture = Capture(arguments.capture, layout)
-    parts = {"temperature_degc": layout.temperature_names}
+    capture = _capture(arguments)
+    parts = {"temperature_degc": capture.layout.temperature_names}
     with (
         table(arguments.output, (".csv", ".npz"), parts) as rows,
         progress("decode", capture.size) as advance,
     ):
         for pulses in capture.pulses(advance):
-            rows.write(pulse_columns(pulses, layout))
+            rows.write(pulse_columns(pulses, capture.layout))
     _report(capture, arguments.output)
 
 
 def _compensate(arguments: argparse.Namespace) -> None:
-    layout = profiles.load(arguments.profile).layout()
-    calibration = read_calibration(arguments.calibration, arguments.unit)
+    capture = _capture(arguments)
+    if arguments.calibration is not None:
+        calibration = read_calibration(arguments.calibration, arguments.unit)
+        origin = f"calibration {config.sha256(arguments.calibration)[:12]}"
+    elif capture.recording is not None and (recorded := capture.recording.calibration) is not None:
+        calibration, origin = recorded, "calibration of the recording"
+    else:
+        raise InputError("expected --calibration, for only a recording of the service has one in it")
+    layout = capture.layout
     compensator = Compensator(
         coefficients(calibration), layout, rate_filter(arguments.rate_filter, layout.interval_ns)
     )
-    capture = Capture(arguments.capture, layout)
     with (
         table(arguments.output, (".csv", ".npz", ".i50n"), {}) as rows,
         progress("compensate", capture.size) as advance,
@@ -120,11 +187,20 @@ def _compensate(arguments: argparse.Namespace) -> None:
     size_effect = (
         "compensated" if calibration.size_effect else "not compensated: the calibration has no sensing points"
     )
-    print(f"  unit {calibration.serial_number}, calibration {config.sha256(arguments.calibration)[:12]}")
+    print(f"  unit {calibration.serial_number}, {origin}")
     print(f"  size effect {size_effect}; rate filter {arguments.rate_filter}, {compensator.lag} samples late")
 
 
+def _capture(arguments: argparse.Namespace) -> Capture:
+    return Capture(arguments.capture, profiles.load(arguments.profile) if arguments.profile else None)
+
+
 def _sim(arguments: argparse.Namespace) -> None:
+    if arguments.port is not None:
+        _play(arguments)
+        return
+    if arguments.speed or arguments.link:
+        raise InputError("--speed, --link: expected with --port; a capture has no speed")
     layout = profiles.load(arguments.profile).layout()
     scenario = scenarios.load(arguments.scenario)
     samples = scenarios.samples(scenario, layout.interval_ns)
@@ -144,12 +220,60 @@ def _sim(arguments: argparse.Namespace) -> None:
     print(f"{arguments.output}: {samples} samples of {layout.name}, seed {scenario.seed}")
 
 
+def _play(arguments: argparse.Namespace) -> None:
+    if arguments.truth is not None:
+        raise InputError("--truth: expected with -o; a live run has no file beside it")
+    profile = profiles.load(arguments.profile)
+    scenario = scenarios.load(arguments.scenario)
+    speed = speed_of(arguments.speed or "1")
+    print(play(scenario, profile, arguments.port, speed, _say, arguments.link))
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    names = set(Settings.model_fields) - {"format", "version"}
+    given = {name: getattr(arguments, name) for name in names}
+    Service(settings.load(arguments.settings, given), _say).run()
+
+
+def _monitor(arguments: argparse.Namespace) -> None:
+    monitor(arguments.status or settings.default_status_path(), Console())
+
+
+def _status(arguments: argparse.Namespace) -> int:
+    status = ask(arguments.status or settings.default_status_path())
+    if arguments.json:
+        print(json.dumps(status, indent=1))
+    else:
+        print("\n".join([status["health"], *status["reasons"]]))
+    return EXIT_CODES[status["health"]]
+
+
+def _doctor(arguments: argparse.Namespace) -> int:
+    return OK if doctor(arguments.port, arguments.profile, print) else BAD_INPUT
+
+
+def _pack(arguments: argparse.Namespace) -> None:
+    pack(arguments.recording, arguments.output)
+    before, after = arguments.recording.stat().st_size, arguments.output.stat().st_size
+    print(f"{arguments.output}: {after} bytes, was {before}")
+
+
+def _export(arguments: argparse.Namespace) -> None:
+    export(Recording(arguments.recording), arguments.to, arguments.output)
+    print(f"{arguments.recording} -> {arguments.output}")
+
+
+def _say(text: str) -> None:
+    print(text, flush=True)
+
+
 def _check(arguments: argparse.Namespace) -> None:
     kinds: dict[str, type[Model]] = {
         "imu50-calibration": Calibration,
         "imu50-site": Site,
         "imu50-profile": Profile,
         "imu50-scenario": Scenario,
+        "imu50-service": Settings,
     }
     kind = config.kind(arguments.file)
     if kind not in kinds:
@@ -162,7 +286,7 @@ def _report(capture: Capture, output: Path) -> None:
     """The books of a capture, for people."""
     print(f"{capture.path}: {capture.layout.name}, {capture.size} bytes -> {output}")
     print(f"  {capture.accountant.account}")
-    for reason, rejected in sorted(capture.decoder.rejected.items()):
+    for reason, rejected in sorted(capture.rejected.items()):
         name = reason.name.lower().replace("_", " ")
         first = ", ".join(map(str, rejected.first))
         more = ", ..." if rejected.stretches > len(rejected.first) else ""

@@ -81,8 +81,26 @@ def read(path: str | os.PathLike[str], model: type[M]) -> M:
     FaultyFileError
         It is no YAML, or not what the model says; all faults at once.
     """
-    name = os.fspath(path)
-    return parse(_load(_content(Path(path)), name), model, name)
+    return parse_text(_content(Path(path)), model, os.fspath(path))
+
+
+def parse_text(text: bytes, model: type[M], name: str) -> M:
+    """Read and check settings that are in memory already; see `read`.
+
+    Parameters
+    ----------
+    text : bytes
+        YAML, UTF-8.
+    model : subclass of Model
+        What it should be.
+    name : str
+        What messages call it.
+
+    Returns
+    -------
+    Model
+    """
+    return parse(_load(text, name), model, name)
 
 
 def parse(document: object, model: type[M], name: str) -> M:
@@ -304,6 +322,8 @@ def _load(data: bytes, name: str) -> object:
     except yaml.reader.ReaderError as error:
         character = f"0x{error.character:02x}"
         faults.append(f"expected text, got the control character {character}; is it another file?")
+    except (OverflowError, ValueError):  # of PyYAML without libyaml, which leaves such an escape to chr()
+        faults.append("expected text, got an escape (\\U) that is no character; correct it")
     if faults:
         raise FaultyFileError(name, _bounded(faults))
     return document
@@ -468,6 +488,8 @@ def _faults(error: ValidationError, document: object, model: type[Model]) -> lis
             told[_path(place[:-1]), str(len(came))] = [f"{place[-1] + 1} {_things(came)}"]
         elif name == "missing":
             told[where, "missing; add it"] = []
+        elif name == "too_short" and len(came) >= values["min_length"]:
+            continue  # pydantic counts the good items only; the bad ones are told on their own
         elif name in ("too_short", "too_long"):
             limit = "at least {min_length}" if name == "too_short" else "at most {max_length}"
             told[where, str(len(came))] = [f"{limit.format(**values)} {_things(came)}"]

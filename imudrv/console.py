@@ -17,13 +17,13 @@ OK, OUR_FAULT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 _PATIENCE_S = 1.0
 
 
-def guarded(command: Callable[[], None]) -> int:
+def guarded(command: Callable[[], int | None]) -> int:
     """Run a command; what goes wrong becomes one message and an exit code.
 
     Parameters
     ----------
     command : callable
-        The work.
+        The work; an exit code of its own goes before 0.
 
     Returns
     -------
@@ -32,7 +32,7 @@ def guarded(command: Callable[[], None]) -> int:
     """
     console = Console(stderr=True, highlight=False, soft_wrap=True)
     try:
-        command()
+        code = command()
         sys.stdout.flush()
     except InputError as error:
         console.print(f"error: {error}", markup=False)
@@ -48,7 +48,7 @@ def guarded(command: Callable[[], None]) -> int:
         console.print(f"internal error, please report it: {type(error).__name__}: {error}", markup=False)
         console.print("".join(traceback.format_tb(error.__traceback__)[-2:]), markup=False)
         return OUR_FAULT
-    return OK
+    return code or OK
 
 
 @contextmanager

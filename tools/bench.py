@@ -2,6 +2,7 @@
 """How fast the product is, each stage beside what a user would otherwise write.
 
     tools/run python tools/bench.py [--rounds N] [--json]
+    tools/run python tools/bench.py live [--seconds N] [--rounds N] [--json]
 
 A capture with damage in it goes through all stages, piece by piece, in one process on one core. The machine
 and its other work change the figures; the ratios are the message.
@@ -20,6 +21,7 @@ from typing import Final
 
 import numba
 import numpy as np
+from bench_live import live
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
@@ -265,17 +267,35 @@ def show(measures: list[Measure]) -> None:
     console.print(f"One core, {PIECE:,} samples at a time, the best round. Samples of each line: {counts}.")
 
 
+def show_live(quantiles: dict[str, dict[str, float]]) -> None:
+    """Print a table."""
+    table = Table("from the unit's write to the receiver", *quantiles["ratio"])
+    for which, row in quantiles.items():
+        table.add_row(which, *(f"{x:.2f}" if which == "ratio" else f"{x * 1e6:.0f} us" for x in row.values()))
+    Console().print(table)
+
+
 def main() -> None:
     """Measure and tell."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument(
-        "--rounds", type=int, default=12, help="over 5.4 minutes of samples each (default: %(default)s)"
-    )
     parser.add_argument("--json", action="store_true", help="numbers for a machine instead of a table")
+    parser.add_argument(
+        "what", nargs="?", choices=("stages", "live"), default="stages", help="default: stages of the driver"
+    )
+    parser.add_argument("--rounds", type=int, help="default: 12 over 5.4 minutes of samples; live 3 of each")
+    parser.add_argument("--seconds", type=int, default=20, help="of a live round (default: %(default)s)")
     options = parser.parse_args()
-    if options.rounds < 1:
-        parser.error(f"--rounds: expected 1 or more, got {options.rounds}")
-    measures = throughput(options.rounds)
+    rounds = options.rounds or {"stages": 12, "live": 3}[options.what]
+    if rounds < 1 or options.seconds < 1:
+        parser.error("--rounds, --seconds: expected 1 or more")
+    if options.what == "live":
+        quantiles = live(options.seconds, rounds)
+        if options.json:
+            print(json.dumps({"machine": machine(), "seconds": quantiles}, indent=1))
+        else:
+            show_live(quantiles)
+        return
+    measures = throughput(rounds)
     if options.json:
         rows = [{**asdict(m), "ratio": m.ratio} for m in measures]
         print(json.dumps({"machine": machine(), "measures": rows}, indent=1))

@@ -115,11 +115,16 @@ class Compensator:
         Of the profile: sample interval and temperature channels.
     rate_filter : RateFilter
         For the size effect. Its lag holds increments back only where there is a size effect to compensate.
+
+    Attributes
+    ----------
+    has_size_effect : bool
+        Whether there is a size effect to compensate.
     """
 
     def __init__(self, coefficients: Coefficients, layout: Layout, rate_filter: RateFilter) -> None:
         self._interval_ns = layout.interval_ns
-        self._size_effect = coefficients.r_b is not None
+        self.has_size_effect = coefficients.r_b is not None
         self._constants = _constants(coefficients)
         terms = coefficients.temperature
         self._range = (terms.low_degc, terms.high_degc) if terms else (np.inf, -np.inf)
@@ -134,7 +139,7 @@ class Compensator:
     @property
     def lag(self) -> int:
         """Samples by which the output is late."""
-        return self._lag if self._size_effect else 0
+        return self._lag if self.has_size_effect else 0
 
     def feed(self, pulses: Records) -> Records:
         """Compensate pulses.
@@ -160,7 +165,7 @@ class Compensator:
             self._constants,
             self._channels,
             self._range,
-            self._size_effect,
+            self.has_size_effect,
             self._interval_ns,
             self._taps,
             self._lag,

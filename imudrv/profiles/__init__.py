@@ -3,6 +3,8 @@
 A profile is checked whole before anything uses it, and becomes a `Layout` for the decoder.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Literal, Self
@@ -23,6 +25,10 @@ Hex = Annotated[str, Key(pattern=r"^\s*([0-9A-Fa-f]{2}\s*)+$", max_length=64)]
 Name = Annotated[str, Key(pattern=r"^[A-Za-z0-9_.-]+$", max_length=64)]
 
 _AXES = ("x", "y", "z")
+_CLASSIC_BITS = 44
+"""Bits of a classic CAN frame with an identifier of 11 bits, without its data (ISO 11898-1)."""
+_FD_SLOW_BITS, _FD_FAST_BITS = 29, 30
+"""Bits of a CAN FD frame at each rate, without its data: about, for the CRC's length varies."""
 _CAN_FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 
 
@@ -252,6 +258,19 @@ class Profile(Model):
         """CAN FD."""
         return isinstance(self.line, CanLine) and self.line.data_bitrate is not None
 
+    @property
+    def transmission_ns(self) -> int:
+        """Time that the messages of a sample take on the line, ns; on CAN without stuffing and waiting."""
+        lengths = [m.length for m in self.messages if m.every == 1]
+        if isinstance(self.line, SerialLine):
+            bits_a_byte = 1 + self.line.bytesize + (self.line.parity != "none") + self.line.stopbits
+            return round(sum(lengths) * bits_a_byte * NS_PER_S / self.line.baudrate)
+        if self.line.data_bitrate is None:
+            return round(sum(_CLASSIC_BITS + 8 * n for n in lengths) * NS_PER_S / self.line.bitrate)
+        slow = _FD_SLOW_BITS * len(lengths) / self.line.bitrate
+        fast = sum(_FD_FAST_BITS + 8 * n for n in lengths) / self.line.data_bitrate
+        return round((slow + fast) * NS_PER_S)
+
     def layout(self) -> wire.Layout:
         """The form that the decoder and the encoder read."""
         temperatures = [n for m in self.messages for n in m.fields if n.name == "temperature"]
@@ -340,12 +359,26 @@ def load(name_or_path: str) -> Profile:
     InputError
         No such profile, or one with faults.
     """
+    with _file(name_or_path) as path:
+        return read(path, Profile)
+
+
+def content(name_or_path: str) -> bytes:
+    """A profile's file, as it is; see `load`."""
+    with _file(name_or_path) as path:
+        return path.read_bytes()
+
+
+@contextmanager
+def _file(name_or_path: str) -> Iterator[Path]:
     if name_or_path in shipped():
         with resources.as_file(resources.files(__name__) / f"{name_or_path}.yaml") as path:
-            return read(path, Profile)
-    if not Path(name_or_path).exists():
+            yield path
+        return
+    path = Path(name_or_path)
+    if not path.exists():
         raise InputError(
             f"profile {name_or_path!r}: expected one of {', '.join(shipped())}, "
             "or the path of a profile file; there is no such file"
         )
-    return read(name_or_path, Profile)
+    yield path

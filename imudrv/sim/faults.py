@@ -1,6 +1,7 @@
 """What a bad line does: frames damaged, lost, doubled; messages lost, doubled, swapped; silences.
 
-Random, by seed: the same seed fed the same chunks gives the same faults. Other chunks give other ones.
+Random, by seed: the same seed gives the same faults, whatever pieces it is fed in. A cable that is out is a
+silence.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imudrv.errors import InputError
-from imudrv.records import Records
+from imudrv.records import MESSAGE, Records
 from imudrv.sim.scenario import Faults, Silence
 from imudrv.units import NS
 
@@ -59,10 +60,13 @@ class Damage:
         nothing.
     kind : ndarray of uint8, shape (n,)
         A `Kind` each.
+    size : ndarray of int64, shape (n,)
+        Bytes that arrive in place of the frame, or messages in place of the message.
     """
 
     hit: NDArray[np.bool_]
     kind: NDArray[np.uint8]
+    size: NDArray[np.int64]
 
 
 class StreamFaults:
@@ -71,11 +75,11 @@ class StreamFaults:
     Parameters
     ----------
     faults : Faults
-        Of the scenario; `stream` and `silences` are used.
+        Of the scenario; `stream`, `silences` and `unplugs` are used.
     header : bytes
         The bytes that a frame begins with, for false syncs.
     seed : int
-        Same seed and same chunks, same faults.
+        Same seed, same faults.
     """
 
     def __init__(self, faults: Faults, header: bytes, seed: int) -> None:
@@ -90,9 +94,11 @@ class StreamFaults:
             (Kind.FALSE_SYNC_BETWEEN, rates.false_sync_between),
             (Kind.DOUBLED, rates.frame_doubled),
         )
-        self._silences = faults.silences
+        self._silences = faults.silences + faults.unplugs
         self._header = header
-        self._rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(5,)))
+        # what happens and how it happens are drawn apart, so that pieces of any size draw the same
+        self._draw = _generator(seed, 5)
+        self._rng = _generator(seed, 6)
         self._act: dict[Kind, Callable[[bytes], bytes]] = {
             Kind.BIT_FLIPS: self._flip,
             Kind.BYTES_LOST: self._lose,
@@ -133,7 +139,8 @@ class StreamFaults:
                 "faults: expected n frames of 2 bytes or more and n times, "
                 f"got shapes {frames.shape} and {t_ns.shape}"
             )
-        kind = _kinds(self._odds, self._silences, t_ns, self._rng)
+        kind = _kinds(self._odds, self._silences, t_ns, self._draw)
+        size = np.full(n, length)
         pieces = []
         done = 0
         for i in np.flatnonzero(kind).tolist():
@@ -141,10 +148,11 @@ class StreamFaults:
             arrives = self._harm(Kind(kind[i]), frame)
             if arrives == frame:
                 kind[i] = Kind.NONE
+            size[i] = len(arrives)
             pieces += [frames[done:i].tobytes(), arrives]
             done = i + 1
         pieces.append(frames[done:].tobytes())
-        return b"".join(pieces), _damage(kind)
+        return b"".join(pieces), _damage(kind, size)
 
     def _harm(self, kind: Kind, frame: bytes) -> bytes:
         """Harm a frame; it stays whole where chance would leave it readable time after time."""
@@ -184,16 +192,17 @@ class MessageFaults:
     Parameters
     ----------
     faults : Faults
-        Of the scenario; `can` and `silences` are used.
+        Of the scenario; `can`, `silences` and `unplugs` are used.
     seed : int
-        Same seed and same chunks, same faults.
+        Same seed, same faults.
     """
 
     def __init__(self, faults: Faults, seed: int) -> None:
         rates = faults.can
         self._odds = ((Kind.LOST, rates.lost), (Kind.DOUBLED, rates.doubled), (Kind.SWAPPED, rates.swapped))
-        self._silences = faults.silences
-        self._rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(5,)))
+        self._silences = faults.silences + faults.unplugs
+        self._draw = _generator(seed, 5)
+        self._held = np.zeros(0, MESSAGE)
 
     def apply(self, messages: Records) -> tuple[Records, Damage]:
         """Send messages over the bus.
@@ -206,23 +215,38 @@ class MessageFaults:
         Returns
         -------
         ndarray of MESSAGE
-            What arrives; messages that change places leave the times where they are.
+            What arrives; messages that change places leave the times where they are. A last one that is to
+            change places with the next is held until that is fed.
         Damage
-            A row a message sent. `SWAPPED` stands at the first of a pair; the last one fed has nothing behind
-            it and stays, as does one before another fault.
+            A row a message sent and not held. `SWAPPED` stands at the first of a pair; one before another
+            fault stays where it is.
         """
-        kind = _kinds(self._odds, self._silences, messages["t_ns"], self._rng)
-        order = np.arange(messages.size)
+        kind = _kinds(self._odds, self._silences, messages["t_ns"], self._draw)
+        sent = np.concatenate([self._held, messages])
+        kind = np.concatenate([np.full(self._held.size, Kind.SWAPPED, np.uint8), kind])
+        order = np.arange(sent.size)
+        stop = sent.size
         for i in np.flatnonzero(kind == Kind.SWAPPED).tolist():
-            if kind[i] == Kind.SWAPPED and i + 1 < messages.size and kind[i + 1] in (Kind.NONE, Kind.SWAPPED):
+            if kind[i] != Kind.SWAPPED:
+                continue
+            if i + 1 == sent.size:
+                stop = i
+            elif kind[i + 1] in (Kind.NONE, Kind.SWAPPED):
                 order[i], order[i + 1] = i + 1, i
                 kind[i + 1] = Kind.NONE
             else:
                 kind[i] = Kind.NONE
-        arrives = messages[order]
-        arrives["t_ns"] = messages["t_ns"]
+        self._held = sent[stop:].copy()
+        kind = kind[:stop]
+        arrives = sent[order[:stop]]
+        arrives["t_ns"] = sent["t_ns"][:stop]
         copies = np.where(np.isin(kind, _HARM), 0, np.where(kind == Kind.DOUBLED, 2, 1))
-        return np.repeat(arrives, copies), _damage(kind)
+        return np.repeat(arrives, copies), _damage(kind, copies)
+
+    def close(self) -> tuple[Records, Damage]:
+        """End of the run: a message that is held has no next one and arrives as it is."""
+        held, self._held = self._held, self._held[:0]
+        return held, _damage(np.zeros(held.size, np.uint8), np.ones(held.size, np.int64))
 
 
 def _kinds(
@@ -241,5 +265,9 @@ def _kinds(
     return kind
 
 
-def _damage(kind: NDArray[np.uint8]) -> Damage:
-    return Damage(np.isin(kind, _HARM), kind)
+def _damage(kind: NDArray[np.uint8], size: NDArray[np.int64]) -> Damage:
+    return Damage(np.isin(kind, _HARM), kind, size)
+
+
+def _generator(seed: int, stream: int) -> np.random.Generator:
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))

@@ -5,6 +5,7 @@ Durations are rounded to whole sample intervals.
 """
 
 from importlib import resources
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -219,6 +220,10 @@ class Silence(Model):
     duration_s: Duration
 
 
+class Unplug(Silence):
+    """The cable is out: a silence; played live the port goes away and comes back."""
+
+
 class CounterJump(Model):
     """From the first sample that ends after `at_s` the counter is further by `by`; backwards is a restart."""
 
@@ -269,7 +274,18 @@ class Faults(Model):
     stream: StreamRates = StreamRates()
     can: MessageRates = MessageRates()
     silences: Annotated[tuple[Silence, ...], Key(max_length=1000)] = ()
+    unplugs: Annotated[tuple[Unplug, ...], Key(max_length=1000)] = ()
     counter_jumps: Annotated[tuple[CounterJump, ...], Key(max_length=1000)] = ()
+
+    @model_validator(mode="after")
+    def _one_cable(self) -> Self:
+        for before, after in pairwise(self.unplugs):
+            if before.at_s + before.duration_s >= after.at_s:
+                raise ValueError(
+                    f"unplugs: expected one after the other, got one at {after.at_s:g} s "
+                    f"before that of {before.at_s:g} s is over"
+                )
+        return self
 
 
 class Scenario(Model):

@@ -1,15 +1,17 @@
 """The output datagram `I50N`, version 1: 76 bytes a sample, one or more in a packet (ICD, section 7)."""
 
-import zlib
 from enum import IntEnum
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from imudrv.kernels import kernel
 from imudrv.records import INCREMENTS, Records
+from imudrv.wire.check import compute
 from imudrv.wire.layout import Check, CheckKind, Layout, Message
 from imudrv.wire.stream import StreamDecoder
+from imudrv.wire.tables import message_tables
 
 MAGIC: Final = b"I50N"
 VERSION: Final = 1
@@ -56,15 +58,24 @@ def encode(increments: Records, source: Source) -> bytes:
     bytes
         76 a sample, back to back.
     """
-    rows = np.zeros(len(increments), DATAGRAM)
-    rows["magic"] = MAGIC
-    rows["version"] = VERSION
-    rows["source"] = source
-    for name in _SAME:
-        rows[name] = increments[name]
-    data = rows.tobytes()
-    rows["crc"] = [zlib.crc32(data[at : at + _CHECKED]) for at in range(0, len(data), SIZE)]
-    return rows.tobytes()
+    data = np.empty((len(increments), SIZE), np.uint8)
+    _fill(increments, data, data.view(DATAGRAM), int(source), _TABLES.check, _TABLES.crc_table)
+    return data.tobytes()
+
+
+@kernel
+def _fill(increments, data, rows, source, check, crc_table):  # type: ignore[no-untyped-def]
+    """Write datagrams; `rows` and `data` are the same memory."""
+    for i in range(increments.shape[0]):
+        sample, row, out = increments[i], rows[i, 0], data[i]
+        for k in range(len(MAGIC)):
+            out[k] = MAGIC[k]
+        row["version"], row["source"] = VERSION, source
+        row["flags"], row["counter"] = sample["flags"], np.uint32(sample["counter"] & 0xFFFFFFFF)
+        row["interval_ns"], row["t_ns"] = sample["interval_ns"], sample["t_ns"]
+        for k in range(3):
+            row["dtheta_b"][k], row["dv_b"][k] = sample["dtheta_b"][k], sample["dv_b"][k]
+        row["crc"] = np.uint32(compute(out, 0, check, crc_table))
 
 
 class Received(NamedTuple):
@@ -103,6 +114,9 @@ _LAYOUT: Final = Layout(
         ),
     ),
 )
+
+
+_TABLES: Final = message_tables(_LAYOUT, _LAYOUT.messages[0])
 
 
 class DatagramDecoder:

@@ -1,4 +1,4 @@
-"""The decoder of a recorded capture: the stages that its profile needs, and a tally of what is no frame."""
+"""Frames from whatever a unit's line carries, by its profile, and a tally of what is no frame."""
 
 from dataclasses import dataclass, field
 from typing import Final
@@ -31,6 +31,66 @@ class Rejected:
     first: list[int] = field(default_factory=list)
 
 
+class FrameDecoder:
+    """Wire bytes, or CAN messages, to frames.
+
+    Parameters
+    ----------
+    layout : Layout
+        Of the profile.
+    """
+
+    def __init__(self, layout: Layout) -> None:
+        self.rejected: dict[Reason, Rejected] = {}
+        self._decoder = CanAssembler(layout) if layout.can else StreamDecoder(layout)
+
+    def feed(self, data: bytes | memoryview | Records, t_ns: int = 0) -> Records:
+        """Take in what arrived.
+
+        Parameters
+        ----------
+        data : bytes-like or ndarray of MESSAGE
+            Any number of bytes, or for a CAN profile messages.
+        t_ns : int
+            Time of arrival of bytes; messages bear their own.
+
+        Returns
+        -------
+        ndarray of FRAME
+            The frames that became complete.
+        """
+        if isinstance(self._decoder, CanAssembler):
+            assert isinstance(data, np.ndarray)
+            frames, rejects = self._decoder.feed(data)
+        else:
+            assert not isinstance(data, np.ndarray)
+            frames, rejects = self._decoder.feed(data, t_ns)
+        if rejects.size:
+            self.tally(rejects)
+        return frames
+
+    def close(self) -> Records:
+        """End of the line.
+
+        Returns
+        -------
+        ndarray of FRAME
+            The frames that were held back.
+        """
+        frames, rejects = self._decoder.close()
+        self.tally(rejects)
+        return frames
+
+    def tally(self, rejects: Records) -> None:
+        """Count stretches that are no frame, by reason."""
+        for reason in np.unique(rejects["reason"]):
+            same = rejects[rejects["reason"] == reason]
+            entry = self.rejected.setdefault(Reason(reason), Rejected())
+            entry.stretches += len(same)
+            entry.length += int(same["length"].sum())
+            entry.first += same["offset"][: _SHOWN - len(entry.first)].tolist()
+
+
 class CaptureDecoder:
     """Bytes of a capture to frames: a serial stream, or the text of a candump log.
 
@@ -41,10 +101,13 @@ class CaptureDecoder:
     """
 
     def __init__(self, layout: Layout) -> None:
-        self.rejected: dict[Reason, Rejected] = {}
+        self._frames = FrameDecoder(layout)
         self._log = CandumpDecoder() if layout.can else None
-        self._messages = CanAssembler(layout) if layout.can else None
-        self._stream = None if layout.can else StreamDecoder(layout)
+
+    @property
+    def rejected(self) -> dict[Reason, Rejected]:
+        """What is no frame, by reason."""
+        return self._frames.rejected
 
     def feed(self, data: bytes | memoryview) -> Records:
         """Take bytes in.
@@ -59,13 +122,11 @@ class CaptureDecoder:
         ndarray of FRAME
             The frames that became complete.
         """
-        if self._stream is not None:
-            return self._keep(self._stream.feed(data))
-        assert self._log is not None
-        assert self._messages is not None
+        if self._log is None:
+            return self._frames.feed(data)
         messages, rejects = self._log.feed(data)
-        self._tally(rejects)
-        return self._keep(self._messages.feed(messages))
+        self._frames.tally(rejects)
+        return self._frames.feed(messages)
 
     def close(self) -> Records:
         """End of the capture.
@@ -75,24 +136,8 @@ class CaptureDecoder:
         ndarray of FRAME
             The frames that were held back.
         """
-        if self._stream is not None:
-            return self._keep(self._stream.close())
-        assert self._log is not None
-        assert self._messages is not None
+        if self._log is None:
+            return self._frames.close()
         messages, rejects = self._log.close()
-        self._tally(rejects)
-        last = self._keep(self._messages.feed(messages))
-        return np.concatenate([last, self._keep(self._messages.close())])
-
-    def _keep(self, decoded: tuple[Records, Records]) -> Records:
-        frames, rejects = decoded
-        self._tally(rejects)
-        return frames
-
-    def _tally(self, rejects: Records) -> None:
-        for reason in np.unique(rejects["reason"]):
-            same = rejects[rejects["reason"] == reason]
-            entry = self.rejected.setdefault(Reason(reason), Rejected())
-            entry.stretches += len(same)
-            entry.length += int(same["length"].sum())
-            entry.first += same["offset"][: _SHOWN - len(entry.first)].tolist()
+        self._frames.tally(rejects)
+        return np.concatenate([self._frames.feed(messages), self._frames.close()])

@@ -138,15 +138,38 @@ def test_in_a_silence_nothing_is_sent(faults: Callable[..., Faults]) -> None:
     assert stream == frames[~expected].tobytes()
 
 
-def test_the_same_seed_and_chunks_give_the_same_faults(faults: Callable[..., Faults]) -> None:
+def test_the_same_seed_gives_the_same_faults_in_any_chunks(faults: Callable[..., Faults]) -> None:
     rates = faults(stream=STREAM_RATES)
 
-    def in_chunks(seed: int) -> bytes:
+    def in_chunks(seed: int, chunks: int) -> bytes:
         line = StreamFaults(rates, HEADER, seed)
-        return b"".join(line.apply(part, times(50))[0] for part in np.split(frames_of(500), 10))
+        parts = np.array_split(frames_of(500), chunks)
+        return b"".join(line.apply(part, times(len(part)))[0] for part in parts)
 
-    assert in_chunks(1) == in_chunks(1)
-    assert in_chunks(1) != in_chunks(2)
+    assert in_chunks(1, 10) == in_chunks(1, 1) == in_chunks(1, 500)
+    assert in_chunks(1, 10) != in_chunks(2, 10)
+
+
+def test_the_sizes_cut_the_stream_into_what_arrives_of_each_frame(faults: Callable[..., Faults]) -> None:
+    rates = faults(stream=STREAM_RATES, silences=[{"at_s": 0.1, "duration_s": 0.1}])
+    frames, stream, damage = send(StreamFaults(rates, HEADER, 4), 500)
+    assert damage.size.sum() == len(stream)
+    ends = np.cumsum(damage.size)
+    for frame, size, end, kind in zip(frames, damage.size, ends, damage.kind, strict=True):
+        if kind == Kind.NONE:
+            assert stream[end - size : end] == frame.tobytes()
+        if kind in (Kind.SILENCE, Kind.LOST):
+            assert size == 0
+
+
+def test_a_cable_that_is_out_is_a_silence(faults: Callable[..., Faults]) -> None:
+    span = [{"at_s": 0.05, "duration_s": 0.02}]
+    for kind in (
+        StreamFaults(faults(unplugs=span), HEADER, 1),
+        StreamFaults(faults(silences=span), HEADER, 1),
+    ):
+        frames, stream, _ = send(kind, 100)
+        assert stream == frames[:50].tobytes() + frames[70:].tobytes()
 
 
 def test_frames_without_times_are_refused(faults: Callable[..., Faults]) -> None:
@@ -186,9 +209,28 @@ def test_messages_are_lost_doubled_and_swapped_as_told(faults: Callable[..., Fau
 
 
 def test_neighbours_swap_in_pairs_and_the_last_message_has_none(faults: Callable[..., Faults]) -> None:
-    got, damage = MessageFaults(faults(can={"swapped": 1.0}), 1).apply(messages_of(3))
-    np.testing.assert_array_equal(got["id"], [1, 0, 2])
-    np.testing.assert_array_equal(damage.kind, [Kind.SWAPPED, Kind.NONE, Kind.NONE])
+    bus = MessageFaults(faults(can={"swapped": 1.0}), 1)
+    got, damage = bus.apply(messages_of(3))
+    np.testing.assert_array_equal(got["id"], [1, 0])
+    np.testing.assert_array_equal(damage.kind, [Kind.SWAPPED, Kind.NONE])
+    last, damage = bus.close()
+    np.testing.assert_array_equal(last["id"], [2])
+    np.testing.assert_array_equal(damage.kind, [Kind.NONE])
+
+
+def test_a_bus_suffers_the_same_in_any_chunks(faults: Callable[..., Faults]) -> None:
+    rates = faults(can={"lost": 0.1, "doubled": 0.1, "swapped": 0.5})
+
+    def in_chunks(chunks: int) -> Any:
+        bus = MessageFaults(rates, 1)
+        parts = [bus.apply(part) for part in np.array_split(messages_of(500), chunks)]
+        parts.append(bus.close())
+        messages = np.concatenate([arrived for arrived, _ in parts])
+        assert messages.size == sum(damage.size.sum() for _, damage in parts)
+        return messages
+
+    np.testing.assert_array_equal(in_chunks(10), in_chunks(1))
+    np.testing.assert_array_equal(in_chunks(500), in_chunks(1))
 
 
 def test_a_bus_falls_silent_too(faults: Callable[..., Faults]) -> None:

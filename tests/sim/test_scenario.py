@@ -96,6 +96,11 @@ def test_a_missing_calibration_file_is_named(tmp_path: Path) -> None:
         ),
         (
             {"rest": {"duration_s": 1.0}},
+            {"faults": {"unplugs": [{"at_s": 1.0, "duration_s": 2.0}, {"at_s": 2.5, "duration_s": 1.0}]}},
+            "one after the other, got one at 2.5 s before that of 1 s is over",
+        ),
+        (
+            {"rest": {"duration_s": 1.0}},
             {"unit": {"temperature": {"settles_at_degc": 9.0}}},
             "together, got one of them",
         ),

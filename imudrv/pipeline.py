@@ -1,0 +1,123 @@
+"""The stages in a row, as live samples and recorded ones take them: decode, account, stamp, compensate."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from imudrv.imu.accounting import Accountant
+from imudrv.imu.clock import ClockModel
+from imudrv.imu.compensation import Coefficients, Compensator
+from imudrv.imu.rate_filter import RateFilter
+from imudrv.profiles import Profile
+from imudrv.records import Flag, Records
+from imudrv.wire.decoder import FrameDecoder
+
+
+class Sampled(NamedTuple):
+    """What became of one arrival.
+
+    Parameters
+    ----------
+    pulses : ndarray of PULSES
+        Accounted for.
+    increments : ndarray of INCREMENTS
+        Compensated and stamped; with a rate filter that lags, of earlier samples.
+    """
+
+    pulses: Records
+    increments: Records
+
+
+class Pipeline:
+    """From what arrives to stamped increments; any cut into pieces gives the same bits.
+
+    Parameters
+    ----------
+    profile : Profile
+        What the unit sends.
+    coefficients : Coefficients
+        Its calibration.
+    rate_filter : RateFilter
+        For the size effect.
+    """
+
+    def __init__(self, profile: Profile, coefficients: Coefficients, rate_filter: RateFilter) -> None:
+        self._layout = profile.layout()
+        self._rate_filter = rate_filter
+        self.decoder = FrameDecoder(self._layout)
+        self.accountant = Accountant(self._layout)
+        self.clock = ClockModel(self._layout.interval_ns, profile.transmission_ns)
+        self._compensator = Compensator(coefficients, self._layout, rate_filter)
+        self._next: Compensator | None = None
+        self._last_ns = 0  # time by the counter of the newest increment handed on
+
+    def feed(self, data: bytes | memoryview | Records, t_ns: int) -> Sampled:
+        """Take in what arrived.
+
+        Parameters
+        ----------
+        data : bytes-like or ndarray of MESSAGE
+            Wire bytes, or CAN messages.
+        t_ns : int
+            When, host clock.
+
+        Returns
+        -------
+        Sampled
+        """
+        return self._through(self.decoder.feed(data, t_ns))
+
+    def close(self) -> Sampled:
+        """End of the line: what was held back comes out."""
+        pulses, increments = self._through(self.decoder.close())
+        rest = self._compensator.close()
+        rest = self.clock.stamp(rest[rest["t_ns"] > self._last_ns])
+        return Sampled(pulses, np.concatenate([increments, rest]))
+
+    def exchange(self, coefficients: Coefficients) -> None:
+        """Go over to another calibration between two samples.
+
+        The new one is first fed beside the old one until it knows the rates, so that no sample misses its
+        size effect.
+
+        Parameters
+        ----------
+        coefficients : Coefficients
+            The new calibration.
+        """
+        self._next = Compensator(coefficients, self._layout, self._rate_filter)
+
+    @property
+    def exchanging(self) -> bool:
+        """Whether a new calibration is still on its way in."""
+        return self._next is not None
+
+    def _through(self, frames: Records) -> Sampled:
+        pulses = self.accountant.feed(frames)
+        if not len(pulses):
+            return Sampled(pulses, self._compensator.feed(pulses))
+        self.clock.feed(pulses)
+        increments = self._compensator.feed(pulses)
+        if self._next is not None:
+            increments = self._exchanged(self._next, pulses, increments)
+        # After an exchange one that lags more gives samples again that the one before has handed on.
+        if len(increments) and increments["t_ns"][0] <= self._last_ns:
+            increments = increments[increments["t_ns"] > self._last_ns]
+        if len(increments):
+            self._last_ns = int(increments["t_ns"][-1])
+        return Sampled(pulses, self.clock.stamp(increments))
+
+    def _exchanged(self, new: Compensator, pulses: Records, old: Records) -> Records:
+        """Increments of the old calibration up to where the new one knows its rates, then of the new one."""
+        fresh = new.feed(pulses)
+        if new.has_size_effect:
+            ready = fresh["flags"] & Flag.SIZE_EFFECT != 0
+        else:
+            ready = np.ones(len(fresh), np.bool_)
+        if not ready.any():
+            return old
+        since = fresh["t_ns"][ready.argmax()]
+        if new.lag < self._compensator.lag:
+            old = np.concatenate([old, self._compensator.close()])
+        self._compensator, self._next = new, None
+        return np.concatenate([old[old["t_ns"] < since], fresh[fresh["t_ns"] >= since]])

@@ -1,0 +1,221 @@
+"""Messages from a CAN bus, by any interface of python-can."""
+
+import difflib
+import errno
+import logging
+import os
+import socket
+import struct
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import can
+import numpy as np
+
+from imudrv import config
+from imudrv.errors import InputError
+from imudrv.hostclock import now_ns
+from imudrv.ports.base import Arrival, Port, PortLostError
+from imudrv.ports.serial import explain
+from imudrv.ports.url import Url, require_transport, value
+from imudrv.profiles import CanLine, Profile
+from imudrv.records import MESSAGE, Records
+from imudrv.wire.datagram import Source
+
+# Whatever python-can logs stands in our messages too; without a handler it would go to the terminal.
+logging.getLogger("can").addHandler(logging.NullHandler())
+
+_ROW: Final = struct.Struct("=qIBB64s2x")
+"""A row of MESSAGE; the data come out padded with zeros."""
+assert _ROW.size == MESSAGE.itemsize
+_AT_ONCE: Final = 4096
+"""Most messages of one read."""
+_BUFFER_BYTES: Final = 1 << 22
+"""Asked of the system for a socket: its usual 200 kB hold 0.1 s of messages."""
+_ID_MASK: Final = 0x1FFFFFFF
+_BUS_OFF: Final = 0x40
+"""Bit in the identifier of an error frame (linux/can/error.h)."""
+_RESERVED: Final = ("interface", "channel", "can_filters", "config_context", "ignore_config", "timing")
+_TIMED: Final = ("pcan", "slcan")
+"""Interfaces that learn a data bit rate only from a whole bit timing."""
+_ARPHRD_CAN: Final = "280"
+
+
+def prepare(url: Url, profile: Profile) -> Callable[[], Port]:
+    """Check a ``can://`` URL.
+
+    Parameters
+    ----------
+    url : Url
+        ``can://INTERFACE/CHANNEL``.
+    profile : Profile
+        Of a CAN unit; its bit rates hold where the URL has none, and only its identifiers are received.
+
+    Returns
+    -------
+    callable
+        Opens the port; raises `PortLostError` when the bus is not there.
+
+    Raises
+    ------
+    InputError
+        It makes no sense.
+    """
+    require_transport(url, profile, "can")
+    interface, _, channel = url.address.partition("/")
+    if not interface or not channel:
+        raise InputError(f"{url.text}: expected can://INTERFACE/CHANNEL like can://socketcan/can0")
+    if interface not in can.VALID_INTERFACES:
+        near = difflib.get_close_matches(interface, can.VALID_INTERFACES, 1)
+        known = f"did you mean {near[0]}?" if near else f"known are {', '.join(sorted(can.VALID_INTERFACES))}"
+        raise InputError(f"{url.text}: expected an interface of python-can, got {interface!r}; {known}")
+    options: dict[str, Any] = {name: value(text) for name, text in url.options.items()}
+    if taken := [name for name in options if name in _RESERVED]:
+        raise InputError(
+            f"{url.text}: expected other options, got {', '.join(taken)}; the URL or profile says it"
+        )
+    fd = options.pop("fd", profile.fd)
+    if not isinstance(fd, bool):
+        raise InputError(f"{url.text}: fd: expected true or false, got {url.options['fd']}")
+    asked = {name: options.pop(name) for name in CanLine.model_fields if name in options}
+    line = config.parse({**profile.line.model_dump(), **asked}, CanLine, url.text)
+    options |= _rates(url, interface, line, fd)
+    filters = [{"can_id": message.id, "can_mask": _ID_MASK} for message in profile.messages]
+    return partial(_open, url.text, interface, channel, {**options, "can_filters": filters})
+
+
+class CanPort(Port):
+    """A CAN bus; error and remote frames are left out.
+
+    Parameters
+    ----------
+    url : str
+        As the user gave it.
+    bus : can.BusABC
+        Open; shut down by `close`.
+    """
+
+    def __init__(self, url: str, bus: can.BusABC) -> None:
+        super().__init__(url, Source.HARDWARE)
+        self.bus = bus
+        self._closed = False
+
+    def read(self, timeout_s: float) -> Arrival:
+        """See `Port.read`; each message has the time when it was taken in."""
+        if self._closed:
+            raise PortLostError(f"{self.url}: the port is closed")
+        rows = []
+        message = self._receive(timeout_s)
+        while message is not None:
+            if message.is_error_frame:
+                if message.arbitration_id & _BUS_OFF:
+                    raise self._bus_off()
+            elif not message.is_remote_frame:
+                data, identifier = message.data, message.arbitration_id & _ID_MASK
+                rows.append(_ROW.pack(now_ns(), identifier, len(data), message.is_fd, data))
+            message = self._receive(0) if len(rows) < _AT_ONCE else None
+        if not rows and self._is_off():
+            raise self._bus_off()
+        # A bytearray, because arrays on bytes are read-only and would be another type to the kernels.
+        messages: Records = np.frombuffer(bytearray().join(rows), MESSAGE)
+        return Arrival(now_ns(), messages)
+
+    def close(self) -> None:
+        """See `Port.close`."""
+        if self._closed:
+            return
+        self._closed = True
+        with suppress(Exception):  # a driver may raise anything
+            self.bus.shutdown()
+        # A serial adapter that is gone cannot be told to stop; shutdown gives up before it closes the device.
+        device = getattr(self.bus, "serialPortOrig", None)
+        if device is not None:
+            device.close()
+
+    def _is_off(self) -> bool:
+        try:
+            return self.bus.state is can.BusState.ERROR
+        except NotImplementedError:
+            return False
+        except Exception as error:  # a driver may raise anything
+            raise PortLostError(f"{self.url}: {_in_words(error)}") from error
+
+    def _bus_off(self) -> PortLostError:
+        return PortLostError(f"{self.url}: the controller is bus-off; check wiring and bit rate")
+
+    def _receive(self, timeout_s: float) -> can.Message | None:
+        try:
+            return self.bus.recv(timeout_s)
+        except (ValueError, IndexError):
+            return None  # an adapter's line that is no message
+        except Exception as error:  # a driver may raise anything
+            if str(error) == "could not unpack received message":
+                return None  # a stranger's datagram
+            raise PortLostError(f"{self.url}: {_in_words(error)}") from error
+
+
+def _rates(url: Url, interface: str, line: CanLine, fd: bool) -> dict[str, Any]:
+    if not fd:
+        return {"fd": False, "bitrate": line.bitrate}
+    data_bitrate = line.data_bitrate or line.bitrate
+    if interface not in _TIMED:
+        return {"fd": True, "bitrate": line.bitrate, "data_bitrate": data_bitrate}
+    try:
+        timing = can.BitTimingFd.from_sample_point(80_000_000, line.bitrate, 80.0, data_bitrate, 75.0)
+    except ValueError as error:
+        raise InputError(f"{url.text}: {error}") from error
+    return {"fd": True, "timing": timing}
+
+
+def _open(url: str, interface: str, channel: str, options: dict[str, Any]) -> Port:
+    try:
+        bus = can.Bus(channel, interface, ignore_config=True, **options)
+    except NotImplementedError as error:
+        hint = "; pip install msgpack" if "msgpack" in str(error) else ""
+        raise InputError(f"{url}: interface {interface} cannot be used here: {error}{hint}") from error
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{url}: {error}") from error
+    except Exception as error:  # a driver may raise anything
+        if isinstance(error.__cause__, ValueError):
+            raise InputError(f"{url}: {error}") from error
+        raise PortLostError(f"{url}: {_why_not(interface, channel, error)}") from error
+    _enlarge_buffer(bus)
+    return CanPort(url, bus)
+
+
+def _enlarge_buffer(bus: can.BusABC) -> None:
+    with (
+        suppress(OSError, NotImplementedError, can.CanError),
+        socket.socket(fileno=os.dup(bus.fileno())) as receiver,
+    ):
+        receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+
+
+def _why_not(interface: str, channel: str, error: Exception) -> str:
+    cause = error.__cause__
+    if interface == "slcan" and isinstance(cause, OSError):
+        return explain(channel, cause)
+    if interface == "socketcan" and isinstance(error, OSError):
+        if error.errno == errno.ENODEV:
+            return f"there is no CAN interface {channel}; {_interfaces_there_are()}"
+        if error.errno == errno.EAFNOSUPPORT:
+            return "this system's kernel has no CAN (module can_raw)"
+    return f"cannot open it: {_in_words(error)}"
+
+
+def _interfaces_there_are() -> str:
+    kinds = sorted(Path("/sys/class/net").glob("*/type"))
+    names = [kind.parent.name for kind in kinds if kind.read_text().strip() == _ARPHRD_CAN]
+    return f"there are {', '.join(names)}" if names else "there is none at all: is the adapter plugged in?"
+
+
+def _in_words(error: Exception) -> str:
+    code = error.error_code if isinstance(error, can.CanError) else getattr(error, "errno", None)
+    if code == errno.ENETDOWN:
+        return "the CAN interface is down; `sudo ip link set NAME up type can bitrate RATE`"
+    cause = error.__cause__
+    text = getattr(error, "strerror", None) or str(error) or type(error).__name__
+    return f"{text}: {cause}" if isinstance(cause, OSError) and str(cause) not in text else text

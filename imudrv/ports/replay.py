@@ -1,0 +1,202 @@
+"""What was recorded, once more: a raw capture, a candump log, a recording.
+
+At a given speed the pieces come when they are due, by deadlines counted from the first one; a piece is what
+one millisecond of real time brings, or one read of a recording. With ``max`` they come as fast as they can be
+read, in large pieces.
+
+Each piece has the time of its end: of a log and a recording the recorded one; of a raw capture, which has
+none, the sample interval times the frames of the profile that the bytes up to there make, from 0 on. So a
+replay at a given speed brings the same pieces with the same times whenever it is run, and a message or a read
+of a recording has the same time at any speed.
+"""
+
+import math
+import time
+from collections.abc import Callable, Generator
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from imudrv.errors import InputError
+from imudrv.hostclock import now_ns
+from imudrv.ports.base import Arrival, Port, PortEndedError, PortLostError
+from imudrv.ports.url import Url
+from imudrv.profiles import Profile
+from imudrv.records import MESSAGE, Records
+from imudrv.units import NS
+from imudrv.wire.candump import CandumpDecoder
+from imudrv.wire.datagram import Source
+from imudrv.wire.layout import Layout
+
+_CHUNK_BYTES: Final = 1 << 16
+_STEP_NS: Final = 1_000_000
+_FASTEST: Final = 1e6
+
+Pieces = Generator[Arrival, None, None]
+
+
+def prepare(url: Url, profile: Profile) -> Callable[[], Port]:
+    """Check a ``replay://`` URL.
+
+    Parameters
+    ----------
+    url : Url
+        ``replay://FILE``.
+    profile : Profile
+        What the file holds; a CAN profile reads candump logs, another one raw captures.
+
+    Returns
+    -------
+    callable
+        Opens the port; raises `InputError` where the file turns out to be another one.
+
+    Raises
+    ------
+    InputError
+        It makes no sense, or the file is not there or empty.
+    """
+    if unknown := [name for name in url.options if name != "speed"]:
+        raise InputError(f"{url.text}: expected no option but speed, got {', '.join(unknown)}")
+    speed = _speed(url)
+    path = Path(url.address)
+    try:
+        with path.open("rb") as file:
+            empty = not file.read(1)
+    except OSError as error:
+        raise InputError(
+            f"{url.text}: expected a file to replay, cannot read it: {error.strerror}"
+        ) from error
+    if empty:
+        raise InputError(f"{url.text}: expected a file to replay, got an empty one")
+    return partial(_open, url.text, path, profile.layout(), speed)
+
+
+class ReplayPort(Port):
+    """Pieces of a file, at their pace.
+
+    Parameters
+    ----------
+    url : str
+        As the user gave it.
+    pieces : generator of Arrival
+        In the order of the file; closed by `close`.
+    speed : float or None
+        Times the recorded pace; None: no pace.
+    nothing : bytes or ndarray of MESSAGE
+        What a read brings when nothing was due.
+    """
+
+    def __init__(self, url: str, pieces: Pieces, speed: float | None, nothing: bytes | Records) -> None:
+        super().__init__(url, Source.REPLAY)
+        self._pieces = pieces
+        self._speed = speed
+        self._nothing = nothing
+        self._piece = next(pieces, None)
+        self._first_ns = self._piece.t_ns if self._piece else 0
+        self._begin_ns: int | None = None
+        self._closed = False
+
+    def read(self, timeout_s: float) -> Arrival:
+        """See `Port.read`; the pace counts from the first read."""
+        if self._closed:
+            raise PortLostError(f"{self.url}: the port is closed")
+        if self._piece is None:
+            self._piece = self._following()
+        if self._speed is not None and not self._is_due(self._piece, timeout_s, self._speed):
+            return Arrival(self._reached_ns(self._speed), self._nothing)
+        piece, self._piece = self._piece, None
+        return piece
+
+    def close(self) -> None:
+        """See `Port.close`."""
+        self._closed = True
+        self._pieces.close()
+
+    def _following(self) -> Arrival:
+        try:
+            return next(self._pieces)
+        except StopIteration:
+            raise PortEndedError(f"{self.url}: the end of the file") from None
+        except OSError as error:
+            raise InputError(f"{self.url}: cannot read on: {error.strerror or error}") from error
+
+    def _is_due(self, piece: Arrival, timeout_s: float, speed: float) -> bool:
+        """Wait for the piece, but not longer than the timeout."""
+        left_s = (piece.t_ns - self._reached_ns(speed)) * NS / speed
+        if left_s > 0:
+            time.sleep(min(left_s, timeout_s))
+        return left_s <= timeout_s
+
+    def _reached_ns(self, speed: float) -> int:
+        """How far the replay is, recorded time."""
+        now = now_ns()
+        if self._begin_ns is None:
+            self._begin_ns = now
+        return self._first_ns + int((now - self._begin_ns) * speed)
+
+
+def _speed(url: Url) -> float | None:
+    text = url.options.get("speed", "1")
+    if text == "max":
+        return None
+    try:
+        speed = float(text)
+    except ValueError:
+        speed = math.nan
+    if not 0 < speed <= _FASTEST:
+        raise InputError(f"{url.text}: speed: expected max or a factor up to {_FASTEST:g}, got {text!r}")
+    return speed
+
+
+def _open(url: str, path: Path, layout: Layout, speed: float | None) -> Port:
+    step_ns = None if speed is None else max(1, int(speed * _STEP_NS))
+    nothing: bytes | Records = np.zeros(0, MESSAGE) if layout.can else b""
+    if path.suffix == ".mcap":
+        pieces = _recording(path, layout)
+    elif layout.can:
+        pieces = _log(path, layout, step_ns)
+    else:
+        pieces = _capture(path, layout, step_ns)
+    return ReplayPort(url, pieces, speed, nothing)
+
+
+def _capture(path: Path, layout: Layout, step_ns: int | None) -> Pieces:
+    length = layout.messages[0].length
+    frames = max(1, _CHUNK_BYTES // length if step_ns is None else step_ns // layout.interval_ns)
+    end = 0
+    with path.open("rb") as file:
+        while data := file.read(frames * length):
+            end += len(data)
+            yield Arrival(math.ceil(end / length) * layout.interval_ns, data)
+
+
+def _log(path: Path, layout: Layout, step_ns: int | None) -> Pieces:
+    decoder = CandumpDecoder()
+    found = 0
+    with path.open("rb") as file:
+        text = b"\n"
+        while text:
+            text = file.read(_CHUNK_BYTES)
+            messages, _ = decoder.feed(text) if text else decoder.close()
+            found += messages.size
+            cuts = () if step_ns is None else np.flatnonzero(np.diff(messages["t_ns"] // step_ns)) + 1
+            for piece in np.split(messages, cuts):
+                if piece.size:
+                    yield Arrival(int(piece["t_ns"][-1]), piece)
+    if not found:
+        raise InputError(
+            f"{path}: expected a candump log for the CAN profile {layout.name}, "
+            f"got {decoder.bytes_fed} bytes without one message"
+        )
+
+
+def _recording(path: Path, layout: Layout) -> Pieces:
+    from imudrv.recording import Recording
+
+    for arrival in Recording(path).arrivals():
+        if isinstance(arrival.data, bytes) == layout.can:
+            came = "bytes of a serial line" if layout.can else "CAN messages"
+            raise InputError(f"{path}: expected a recording for profile {layout.name}, got one of {came}")
+        yield arrival

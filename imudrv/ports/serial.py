@@ -1,0 +1,279 @@
+"""Bytes from a serial line, or from whatever pyserial takes for one.
+
+A device with a descriptor (a line, a pty, a TCP connection) is read with `select` and one read of the system,
+the quickest way there is; the others as pyserial reads them.
+"""
+
+import errno
+import os
+import select
+import socket
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import urlencode, urlsplit
+
+import serial
+from serial.tools.list_ports import comports
+
+from imudrv import config
+from imudrv.errors import InputError
+from imudrv.hostclock import now_ns
+from imudrv.ports.base import Arrival, Port, PortLostError
+from imudrv.ports.url import Url, require_transport, value
+from imudrv.profiles import Profile, SerialLine
+from imudrv.wire.datagram import Source
+
+_AT_ONCE: Final = 1 << 16
+_SLICE_S: Final = 0.02
+"""Longest wait inside pyserial; its timeout cannot change while it is open without setting the line anew."""
+_CONNECT_S: Final = 1.0
+_PARITY: Final = {
+    "none": serial.PARITY_NONE,
+    "even": serial.PARITY_EVEN,
+    "odd": serial.PARITY_ODD,
+    "mark": serial.PARITY_MARK,
+    "space": serial.PARITY_SPACE,
+}
+_SHOWN_PORTS: Final = 10
+_SYSTEM_ERRORS: tuple[type[Exception], ...] = (OSError,)
+if os.name == "posix":
+    import termios
+
+    _SYSTEM_ERRORS += (termios.error,)
+
+
+def prepare(url: Url, profile: Profile) -> Callable[[], Port]:
+    """Check a URL of pyserial's kind.
+
+    Parameters
+    ----------
+    url : Url
+        Scheme ``serial`` or one of pyserial's.
+    profile : Profile
+        Of a serial unit; its line settings hold where the URL has none.
+
+    Returns
+    -------
+    callable
+        Opens the port; raises `PortLostError` when the device is not there.
+
+    Raises
+    ------
+    InputError
+        It makes no sense.
+    """
+    require_transport(url, profile, "serial")
+    if url.scheme == "socket":
+        return partial(_connect, url.text, _host_and_port(url))
+    own = url.options
+    foreign: dict[str, str] = {}
+    if url.scheme == "serial":
+        _require_device_name(url)
+        target = url.address
+    else:
+        own = {name: text for name, text in url.options.items() if name in SerialLine.model_fields}
+        foreign = {name: text for name, text in url.options.items() if name not in own}
+        target = f"{url.scheme}://{url.address}" + (f"?{urlencode(foreign)}" if foreign else "")
+    asked = {**profile.line.model_dump(), **{name: value(text) for name, text in own.items()}}
+    return partial(_open, url.text, target, config.parse(asked, SerialLine, url.text))
+
+
+def explain(device: str, error: OSError) -> str:
+    """Say in plain words why a serial device cannot be opened, and what to do.
+
+    Parameters
+    ----------
+    device : str
+        Its path.
+    error : OSError
+        What the system said; pyserial's exceptions are such ones.
+
+    Returns
+    -------
+    str
+        One sentence.
+    """
+    match error.errno:
+        case errno.ENOENT | errno.ENODEV | errno.ENXIO:
+            return f"there is no {device}; {_ports_there_are()}"
+        case errno.EACCES | errno.EPERM:
+            return f"no permission for {device}; {_who_may(device)}"
+        case errno.EBUSY | errno.EAGAIN:
+            return f"another program has {device} open; end it (`fuser -v {device}` names it)"
+        case _:
+            return f"cannot open {device}: {error.strerror or error}"
+
+
+class DescriptorPort(Port):
+    """A device that the system can wait for; one read of it is one arrival.
+
+    Nothing that the device holds when it is opened is thrown away: the decoder sorts out what is no frame.
+
+    Parameters
+    ----------
+    url : str
+        As the user gave it.
+    device : Serial or socket
+        Open and not blocking; closed by `close`.
+    """
+
+    def __init__(self, url: str, device: serial.Serial | socket.socket) -> None:
+        super().__init__(url, Source.HARDWARE)
+        self._device = device
+        self._ready = [device.fileno()]
+        self._take: Callable[[int], bytes] = (
+            device.recv if isinstance(device, socket.socket) else partial(os.read, device.fileno())
+        )
+        self._closed = False
+
+    def read(self, timeout_s: float) -> Arrival:
+        """See `Port.read`."""
+        if self._closed:
+            raise PortLostError(f"{self.url}: the port is closed")
+        try:
+            ready = select.select(self._ready, (), (), timeout_s)[0]
+            data = self._take(_AT_ONCE) if ready else b""
+        except BlockingIOError:
+            return Arrival(now_ns(), b"")
+        except OSError as error:
+            raise PortLostError(f"{self.url}: the port is gone: {error.strerror or error}") from error
+        t_ns = now_ns()
+        if ready and not data:
+            raise PortLostError(f"{self.url}: the other end has gone")
+        return Arrival(t_ns, data)
+
+    def close(self) -> None:
+        """See `Port.close`."""
+        if not self._closed:
+            self._closed = True
+            self._device.close()
+
+
+class PyserialPort(Port):
+    """A device that only pyserial can read; a read may take 20 ms longer than its timeout.
+
+    Parameters
+    ----------
+    url : str
+        As the user gave it.
+    device : Serial
+        Open, with a timeout of 20 ms; closed by `close`.
+    """
+
+    def __init__(self, url: str, device: serial.Serial) -> None:
+        super().__init__(url, Source.HARDWARE)
+        self._device = device
+
+    def read(self, timeout_s: float) -> Arrival:
+        """See `Port.read`."""
+        deadline_ns = now_ns() + int(timeout_s * 1e9)
+        try:
+            while not (data := self._device.read(1)) and now_ns() < deadline_ns:
+                pass
+            if data and (waiting := self._device.in_waiting):
+                data += self._device.read(min(waiting, _AT_ONCE))
+        except OSError as error:
+            raise PortLostError(f"{self.url}: the port is gone: {error}") from error
+        return Arrival(now_ns(), data)
+
+    def close(self) -> None:
+        """See `Port.close`."""
+        self._device.close()
+
+
+def _open(url: str, target: str, line: SerialLine) -> Port:
+    settings: dict[str, Any] = {
+        "baudrate": line.baudrate,
+        "bytesize": line.bytesize,
+        "parity": _PARITY[line.parity],
+        "stopbits": line.stopbits,
+        "timeout": _SLICE_S,
+        "exclusive": True if os.name == "posix" else None,
+    }
+    try:
+        device = serial.serial_for_url(target, do_not_open=True, **settings)
+        # Opening a POSIX device empties its buffer otherwise.
+        vars(device)["_reset_input_buffer"] = lambda: None
+        device.open()
+    except KeyError as error:  # pyserial stumbles while it tells of an unknown option
+        raise InputError(f"{url}: {error.__context__ or error}") from error
+    except ValueError as error:
+        cause = error.__context__
+        if isinstance(cause, OSError) and cause.errno != errno.EINVAL:  # gone while its speed was set
+            raise PortLostError(f"{url}: {explain(target, cause)}") from error
+        raise InputError(f"{url}: {error}") from error
+    except _SYSTEM_ERRORS as error:
+        if "expected a string in the form" in str(error):
+            raise InputError(f"{url}: {error}") from error
+        reason = error if isinstance(error, OSError) else OSError(*error.args)
+        raise PortLostError(f"{url}: {explain(target, reason)}") from error
+    if os.name != "posix" or not isinstance(device, serial.Serial) or target.startswith("spy:"):
+        return PyserialPort(url, device)
+    with suppress(ValueError, OSError, NotImplementedError):  # ptys and some drivers have no such mode
+        device.set_low_latency_mode(True)
+    return DescriptorPort(url, device)
+
+
+def _connect(url: str, address: tuple[str, int]) -> Port:
+    # Our own connection: pyserial's throws away what has come already, and waits 0.3 s when it closes.
+    try:
+        connection = socket.create_connection(address, timeout=_CONNECT_S)
+    except OSError as error:
+        raise PortLostError(
+            f"{url}: cannot connect: {error.strerror or error}; is the server running?"
+        ) from error
+    connection.setblocking(False)
+    return DescriptorPort(url, connection)
+
+
+def _host_and_port(url: Url) -> tuple[str, int]:
+    try:
+        parts = urlsplit(f"//{url.address}")
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host = port = None
+    if not host or not port or parts.path:
+        raise InputError(f"{url.text}: expected socket://HOST:PORT, got {url.address!r} as the address")
+    if url.options:
+        raise InputError(f"{url.text}: expected no options for socket://, got {', '.join(url.options)}")
+    return host, port
+
+
+def _require_device_name(url: Url) -> None:
+    if os.name == "posix":
+        device = Path(url.address)
+        if not device.is_absolute():
+            raise InputError(
+                f"{url.text}: expected the path of a device like serial:///dev/ttyUSB0 (three slashes), "
+                f"got {url.address!r}"
+            )
+        if device.exists() and not device.is_char_device():
+            kind = "folder" if device.is_dir() else "file"
+            raise InputError(
+                f"{url.text}: expected a serial device, got a {kind}; a capture is read with "
+                f"replay://{url.address}"
+            )
+    elif not url.address:
+        raise InputError(f"{url.text}: expected the name of a device like serial://COM3, got none")
+
+
+def _ports_there_are() -> str:
+    named = sorted(map(str, Path("/dev/serial/by-id").glob("*")))
+    names = named or sorted(port.device for port in comports())
+    if not names:
+        return "there is no serial port here at all: is it plugged in?"
+    more = ", ..." if len(names) > _SHOWN_PORTS else ""
+    return f"there are {', '.join(names[:_SHOWN_PORTS])}{more}"
+
+
+def _who_may(device: str) -> str:
+    try:
+        group = Path(device).group()
+    except (OSError, KeyError):
+        return "run as a user who may open it"
+    return (
+        f"it is the group's {group}: `sudo usermod -aG {group} $USER`, then log in again, or add a udev rule"
+    )

@@ -1,0 +1,105 @@
+"""A simulated unit as a port, in this process: ``sim://SCENARIO.yaml?speed=1|10|max``."""
+
+import time
+from typing import Final
+
+import numpy as np
+
+from imudrv.errors import InputError
+from imudrv.hostclock import now_ns
+from imudrv.ports.base import Arrival, Port, PortEndedError, PortLostError
+from imudrv.ports.url import split
+from imudrv.profiles import Profile
+from imudrv.records import MESSAGE, Records
+from imudrv.sim.live import AHEAD, MOST, Pace, Playback, speed_of
+from imudrv.sim.scenario import Scenario, load
+from imudrv.wire.datagram import Source
+
+_NOTHING: Final = np.zeros(0, MESSAGE)
+
+
+def open_simulated(url: str, profile: Profile) -> Port:
+    """Open a simulated unit; its run begins now.
+
+    Parameters
+    ----------
+    url : str
+        ``sim://NAME`` of a shipped scenario or ``sim://PATH`` of a file; ``?speed=`` 1 (the default),
+        any other number, or max.
+    profile : Profile
+        What it sends.
+
+    Returns
+    -------
+    Port
+
+    Raises
+    ------
+    InputError
+        No such scenario, one with faults, or another option.
+    """
+    parts = split(url)
+    options = dict(parts.options)
+    speed = speed_of(options.pop("speed", "1"))
+    if options:
+        raise InputError(f"{url}: expected no option but speed, got {', '.join(options)}")
+    return SimulatedPort(url, load(parts.address), profile, speed)
+
+
+class SimulatedPort(Port):
+    """A simulated unit. An unplug of the scenario is a silence here.
+
+    At a finite speed data arrives when it is due, stamped by the host's clock; at full speed as it is read,
+    stamped with the time of the run from its beginning on.
+
+    Parameters
+    ----------
+    url : str
+        As the user gave it.
+    scenario : Scenario
+        What happens.
+    profile : Profile
+        What it sends.
+    speed : float or None
+        Seconds of the run in a second; None: as fast as it is read.
+    """
+
+    def __init__(self, url: str, scenario: Scenario, profile: Profile, speed: float | None) -> None:
+        super().__init__(url, Source.SIMULATOR)
+        self._playback: Playback | None = Playback(scenario, profile.layout())
+        self._is_paced = speed is not None
+        self._most = AHEAD if self._is_paced else MOST
+        self._pace = Pace(speed)
+        self._begin_ns = now_ns()
+        self._nothing: bytes | Records = _NOTHING if profile.transport == "can" else b""
+
+    def read(self, timeout_s: float) -> Arrival:
+        """See `Port.read`."""
+        if self._playback is None:
+            raise PortLostError(f"{self.url}: the port is closed")
+        deadline = time.monotonic() + timeout_s
+        while (due_ns := self._playback.due_ns()) is not None:
+            self._pace.wait(due_ns, max(0.0, deadline - time.monotonic()))
+            due = self._playback.take(self._pace.now_ns(), self._most)
+            if due is not None and len(due.data):
+                return self._stamped(due.data, due.last_ns)
+            if self._is_paced and time.monotonic() >= deadline:
+                return Arrival(now_ns(), self._nothing)
+        raise PortEndedError(f"{self.url}: the scenario is over")
+
+    def _stamped(self, data: bytes | Records, run_ns: int) -> Arrival:
+        t_ns = now_ns() if self._is_paced else self._begin_ns + run_ns
+        if isinstance(data, bytes):
+            return Arrival(t_ns, data)
+        messages = data.copy()
+        if self._is_paced:
+            messages["t_ns"] = t_ns
+        else:
+            messages["t_ns"] += self._begin_ns
+        return Arrival(t_ns, messages)
+
+    def close(self) -> None:
+        """See `Port.close`."""
+        if self._playback is not None:
+            self._playback.close()
+            self._playback = None

@@ -1,0 +1,96 @@
+"""A URL in its parts, and the mistakes that any kind of port can find in one."""
+
+import re
+from typing import Final, NamedTuple
+from urllib.parse import parse_qsl
+
+from imudrv.errors import InputError
+from imudrv.profiles import Profile
+
+PYSERIAL: Final = ("socket", "rfc2217", "spy", "hwgrep", "alt", "loop", "cp2110")
+SCHEMES: Final = tuple(f"{scheme}://" for scheme in ("serial", *PYSERIAL, "can", "replay", "sim"))
+
+
+class Url(NamedTuple):
+    """A URL in its parts.
+
+    Parameters
+    ----------
+    text : str
+        As the user gave it.
+    scheme : str
+        Before ``://``, in small letters; ``serial`` for the bare name of a device.
+    address : str
+        Up to the query, as it stands.
+    options : dict of str to str
+        The query.
+    """
+
+    text: str
+    scheme: str
+    address: str
+    options: dict[str, str]
+
+
+def split(text: str) -> Url:
+    """Take a URL apart.
+
+    Parameters
+    ----------
+    text : str
+        A URL, or the bare name of a serial device: ``/dev/ttyUSB0``, ``COM3``.
+
+    Returns
+    -------
+    Url
+
+    Raises
+    ------
+    InputError
+        It is neither, or an option is given twice or without a value.
+    """
+    before, _, query = text.partition("?")
+    scheme, found, address = before.partition("://")
+    if not found:
+        if not re.match(r"/|COM\d+$", before):
+            known = ", ".join(SCHEMES)
+            raise InputError(
+                f"{text!r}: expected a URL that begins with {known}, or a path like /dev/ttyUSB0"
+            )
+        scheme, address = "serial", before
+    try:
+        pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=True) if query else []
+    except ValueError:
+        raise InputError(f"{text}: expected options as NAME=VALUE with & between, got {query!r}") from None
+    options = dict(pairs)
+    if len(options) < len(pairs):
+        raise InputError(f"{text}: expected each option once, got one twice")
+    return Url(text, scheme.lower(), address, options)
+
+
+def value(text: str) -> bool | float | str:
+    """Read an option's value: true or false, a number, or the text itself."""
+    if text in ("true", "false"):
+        return text == "true"
+    for number in (int, float):
+        try:
+            return number(text)
+        except ValueError:
+            continue
+    return text
+
+
+def require_transport(url: Url, profile: Profile, transport: str) -> None:
+    """Refuse a profile of another kind of wire than the port's.
+
+    Raises
+    ------
+    InputError
+        Says which URLs fit the profile.
+    """
+    if profile.transport != transport:
+        fitting = "can://INTERFACE/CHANNEL" if profile.transport == "can" else "serial:///dev/..."
+        raise InputError(
+            f"{url.text}: expected a port for the {profile.transport} profile {profile.name}, "
+            f"like {fitting}, got a {transport} port; change the URL or the profile"
+        )

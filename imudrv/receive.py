@@ -1,0 +1,211 @@
+"""The other end: samples of a running driver in another program.
+
+with imudrv.receive("udp://:5005") as receiver:
+    for increments in receiver:
+        position += ...
+print(receiver.account)
+"""
+
+import os
+import select
+import socket
+from collections.abc import Callable
+from functools import partial
+from types import TracebackType
+from typing import Final, Self
+from urllib.parse import urlsplit
+
+import numpy as np
+import serial
+
+from imudrv.errors import InputError
+from imudrv.imu.accounting import Account, Accountant
+from imudrv.ports.base import PortLostError
+from imudrv.ports.serial import explain
+from imudrv.ports.url import Url, split
+from imudrv.records import FRAME, Records
+from imudrv.sinks.serial import BAUDRATE
+from imudrv.wire.datagram import DatagramDecoder
+from imudrv.wire.layout import Layout
+
+_EXPECTED: Final = "udp://[HOST]:PORT, tcp://HOST:PORT or serial:///dev/ttyUSB0?baudrate=921600"
+_LOOPBACK: Final = "127.0.0.1"
+_AT_ONCE: Final = 1 << 16
+_QUEUE: Final = 1 << 22  # the system's usual one holds a quarter of a second of single samples
+_CONNECT_S: Final = 5.0
+_COUNTED: Final = Layout(
+    name="I50N",
+    can=False,
+    fd=False,
+    big_endian=False,
+    interval_ns=1,
+    totals=False,
+    counter_bits=32,
+    pulse_bits=32,
+    messages=(),
+)
+
+
+class Receiver:
+    """Samples as they come: an iterator over arrays of one or more; made by `receive`.
+
+    Each sample comes once and in the order of the counter: a duplicate or late one, as a network may make
+    them, is counted and left out. The iteration ends when the other end has gone, or after a wait of
+    `timeout_s` in vain. It is a context manager and closes what it opened.
+
+    Parameters
+    ----------
+    url : str
+        See `receive`.
+    timeout_s : float or None
+        Longest wait; None: for ever.
+
+    Attributes
+    ----------
+    rejected_bytes : int
+        What came and was no datagram.
+    """
+
+    def __init__(self, url: str, timeout_s: float | None) -> None:
+        self.rejected_bytes = 0
+        self._timeout_s = timeout_s
+        self._decoder = DatagramDecoder()
+        self._accountant = Accountant(_COUNTED)
+        self._ordered(b"")  # whatever has to be compiled is compiled before samples wait
+        self._device = _open(split(url))
+        self._is_packets = isinstance(self._device, socket.socket) and (
+            self._device.type == socket.SOCK_DGRAM
+        )
+        self._read: Callable[[int], bytes] = (
+            self._device.recv
+            if isinstance(self._device, socket.socket)
+            else partial(os.read, self._device.fileno())
+        )
+        self._is_open = True
+
+    @property
+    def account(self) -> Account:
+        """Where every sample went, by the counter."""
+        return self._accountant.account
+
+    @property
+    def lost(self) -> int:
+        """Samples that the counter says there were and that were not handed on."""
+        return self.account.lost
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> Records:
+        """Wait for samples.
+
+        Returns
+        -------
+        ndarray of INCREMENTS
+            One or more: `counter`, `t_ns`, `interval_ns`, `dtheta_b`, `dv_b`, `flags`.
+        """
+        while self._is_open and select.select([self._device.fileno()], (), (), self._timeout_s)[0]:
+            try:
+                data = self._read(_AT_ONCE)
+            except OSError:
+                data = b""
+                self.close()
+            if not data and not self._is_packets:
+                self.close()
+            if len(increments := self._ordered(data)):
+                return increments
+        raise StopIteration
+
+    def close(self) -> None:
+        """Give the port back; the iteration ends."""
+        self._is_open = False
+        self._device.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _ordered(self, data: bytes) -> Records:
+        """Samples in `data` that are new and in order."""
+        received = self._decoder.feed(data)
+        self.rejected_bytes += int(received.rejects["length"].sum())
+        frames = np.zeros(len(received.increments), FRAME)
+        frames["counter"] = received.increments["counter"]
+        frames["t_ns"] = np.arange(len(frames))  # comes back as the arrival: which ones were good
+        in_order: Records = received.increments[self._accountant.feed(frames)["arrival_ns"]]
+        return in_order
+
+
+def receive(url: str, timeout_s: float | None = None) -> Receiver:
+    """Receive the samples that `imudrv run --out` sends.
+
+    Parameters
+    ----------
+    url : str
+        ``udp://[HOST]:PORT`` listens, on the loopback unless another HOST of this machine is given;
+        ``tcp://HOST:PORT`` connects; ``serial:///dev/ttyUSB0?baudrate=921600`` opens a line.
+    timeout_s : float, optional
+        Longest wait for samples, after which the iteration ends; without it there is no end to the wait.
+
+    Returns
+    -------
+    Receiver
+        To iterate over.
+
+    Raises
+    ------
+    InputError
+        It is no such URL.
+    PortLostError
+        It cannot be opened now: nobody serves there, the port is taken, the line is not there.
+    """
+    return Receiver(url, timeout_s)
+
+
+def _open(url: Url) -> socket.socket | serial.Serial:
+    if url.scheme == "serial":
+        return _open_line(url)
+    if url.scheme not in ("udp", "tcp"):
+        raise InputError(f"{url.text}: expected {_EXPECTED}, got {url.scheme}://")
+    try:
+        parts = urlsplit(f"//{url.address}")
+        host, port = parts.hostname or _LOOPBACK, parts.port
+    except ValueError:
+        port = None
+    if port is None or parts.path or url.options:
+        raise InputError(f"{url.text}: expected {url.scheme}://HOST:PORT")
+    try:
+        if url.scheme == "tcp":
+            return socket.create_connection((host, port), _CONNECT_S)
+        return _listen(host, port)
+    except OSError as error:
+        doing = "connect; is the driver running?" if url.scheme == "tcp" else "listen"
+        raise PortLostError(f"{url.text}: cannot {doing} ({error.strerror or error})") from error
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+    listener = socket.socket(family, kind)
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _QUEUE)
+        listener.bind(address)
+    except OSError:
+        listener.close()
+        raise
+    return listener
+
+
+def _open_line(url: Url) -> serial.Serial:
+    baudrate = url.options.get("baudrate", str(BAUDRATE))
+    if not url.address or url.options.keys() - {"baudrate"} or not baudrate.isdecimal():
+        raise InputError(f"{url.text}: expected {_EXPECTED}")
+    try:
+        return serial.Serial(url.address, int(baudrate), timeout=0, exclusive=True)
+    except ValueError as error:
+        raise InputError(f"{url.text}: {error}") from error
+    except serial.SerialException as error:
+        raise PortLostError(f"{url.text}: {explain(url.address, error)}") from error

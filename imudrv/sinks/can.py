@@ -1,0 +1,179 @@
+"""Pulses out again on a CAN bus, in any CAN profile: a gateway."""
+
+import time
+from contextlib import closing, suppress
+from queue import Empty, SimpleQueue
+from threading import Thread
+from typing import Final
+
+import can
+import numpy as np
+
+from imudrv import profiles
+from imudrv.errors import InputError
+from imudrv.ports.base import PortLostError
+from imudrv.ports.can import CanPort, prepare
+from imudrv.ports.url import split
+from imudrv.records import PULSES, Records
+from imudrv.sinks.base import Batch, Sink, SinkState
+from imudrv.wire.encode import CanEncoder
+from imudrv.wire.layout import Layout
+
+LIMIT: Final = 4096
+"""Samples that wait at the most."""
+_RETRY_S: Final = 1.0
+_SEND_S: Final = 0.1
+_LAST_SECOND_S: Final = 1.0
+
+
+class CanSink(Sink):
+    """Gateway to a CAN bus.
+
+    What the profile cannot say is dropped and counted: a sample whose pulses its fields cannot hold, and one
+    that covers several intervals unless the profile has running totals. Temperatures go by what they
+    measure; one that the unit does not have goes out as zero counts. Drivers may block, hence a thread sends.
+
+    Parameters
+    ----------
+    url : str
+        ``can://INTERFACE/CHANNEL?profile=imu50-can``; what else stands behind the ``?`` goes to python-can,
+        bit rates come from the profile unless given.
+    layout : Layout
+        Of the unit.
+
+    Raises
+    ------
+    InputError
+        No such interface or profile, or one with another sample rate than the unit's.
+    """
+
+    def __init__(self, url: str, layout: Layout) -> None:
+        super().__init__(url)
+        parts = split(url)
+        if "profile" not in parts.options:
+            raise InputError(f"{url}: expected the outgoing profile, got none; add ?profile=imu50-can")
+        profile = profiles.load(parts.options.pop("profile"))
+        self._open = prepare(parts, profile)
+        self._layout = profile.layout()
+        if self._layout.interval_ns != layout.interval_ns:
+            raise InputError(
+                f"{url}: expected a profile of the unit's {1e9 / layout.interval_ns:g} samples a second, "
+                f"got {profile.name} with {profile.sample_rate_hz:g}; take another profile"
+            )
+        self._temperatures = _related(layout.temperature_names, self._layout.temperature_names)
+        CanEncoder(self._layout).encode(np.zeros(1, PULSES))  # compiled before samples come
+        self._encoder = CanEncoder(self._layout)
+        self._queue: SimpleQueue[Records | None] = SimpleQueue()
+        self._put = self._evicted = 0  # counted by the loop
+        self._sent = self._given_up = 0  # counted by the thread
+        self._trouble = "not open yet"
+        self._is_closing = False
+        self._thread = Thread(target=self._run, name="CAN sink", daemon=True)
+        self._thread.start()
+
+    def publish(self, batch: Batch) -> None:
+        """Hand a batch on."""
+        self._put += batch.pulses.size
+        self._queue.put(batch.pulses)
+        with suppress(Empty):
+            while self._queued > LIMIT:
+                oldest = self._queue.get_nowait()
+                self._evicted += 0 if oldest is None else oldest.size
+
+    @property
+    def state(self) -> SinkState:
+        """How it is now."""
+        words = self._trouble or "ok"
+        dropped = self._evicted + self._given_up
+        return SinkState(self.url, words, not self._trouble, self._sent, dropped, self._queued)
+
+    def close(self) -> None:
+        """Send what waits, for a second at the most, and let go."""
+        self._queue.put(None)
+        self._thread.join(_LAST_SECOND_S)
+        self._is_closing = True
+        self._thread.join(_LAST_SECOND_S)
+        self._evicted += self._queued
+
+    @property
+    def _queued(self) -> int:
+        return self._put - self._evicted - self._sent - self._given_up
+
+    def _run(self) -> None:
+        is_on = True
+        while is_on and not self._is_closing:
+            try:
+                port = self._open()
+                assert isinstance(port, CanPort)
+                with closing(port):
+                    self._trouble = ""
+                    self._serve(port.bus)
+                    return
+            except PortLostError as error:
+                self._trouble = str(error).removeprefix(f"{self.url}: ")
+            except Exception as error:  # a driver may raise anything
+                self._trouble = str(error) or type(error).__name__
+            is_on = self._idle(_RETRY_S)
+
+    def _serve(self, bus: can.BusABC) -> None:
+        """Send until the end of the queue."""
+        while (pulses := self._queue.get()) is not None and not self._is_closing:
+            done = 0
+            try:
+                for row in range(pulses.size):
+                    is_sent = self._send(bus, pulses[row : row + 1])
+                    self._sent += is_sent
+                    self._given_up += not is_sent
+                    done += 1
+            except BaseException:
+                self._given_up += pulses.size - done
+                raise
+
+    def _idle(self, seconds: float) -> bool:
+        """Let samples go by while there is no bus; whether the queue goes on."""
+        until = time.monotonic() + seconds
+        with suppress(Empty):
+            while (left := until - time.monotonic()) > 0:
+                pulses = self._queue.get(timeout=left)
+                if pulses is None:
+                    return False
+                self._given_up += pulses.size
+        return True
+
+    def _send(self, bus: can.BusABC, pulses: Records) -> bool:
+        """Send one sample; whether the profile can say it."""
+        if pulses["interval_ns"][0] != self._layout.interval_ns and not self._layout.totals:
+            return False
+        try:
+            messages = self._encoder.encode(self._renamed(pulses))
+        except InputError:
+            return False
+        for message in messages:
+            identifier, length = int(message["id"]), int(message["length"])
+            bus.send(
+                can.Message(
+                    arbitration_id=identifier,
+                    is_extended_id=identifier > 0x7FF,
+                    is_fd=self._layout.fd,
+                    bitrate_switch=self._layout.fd,
+                    data=message["data"][:length].tobytes(),
+                ),
+                timeout=_SEND_S,
+            )
+        return True
+
+    def _renamed(self, pulses: Records) -> Records:
+        """Move temperatures to the channels where the outgoing profile has them."""
+        renamed = pulses.copy()
+        for channel, sources in enumerate(self._temperatures):
+            degc = pulses["temperature_degc"][:, sources].mean(axis=1) if sources else np.nan
+            renamed["temperature_degc"][:, channel] = degc
+        return renamed
+
+
+def _related(have: tuple[str, ...], want: tuple[str, ...]) -> list[list[int]]:
+    """For each wanted sensor the channels that measure it: ``accelerometer`` is the mean of all three."""
+    return [
+        [k for k, name in enumerate(have) if name.startswith(sensor) or sensor.startswith(name)]
+        for sensor in want
+    ]

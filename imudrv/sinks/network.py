@@ -1,0 +1,254 @@
+"""Datagrams over the network: UDP to one receiver, TCP to all who connect."""
+
+import select
+import socket
+import time
+from typing import Any, Final, TypeAlias
+from urllib.parse import urlsplit
+
+from imudrv.errors import InputError
+from imudrv.sinks.backlog import Backlog
+from imudrv.sinks.base import Batch, Sink, SinkState
+from imudrv.wire.datagram import SIZE
+
+MAX_CLIENTS: Final = 32
+_UDP_PIECE: Final = 18  # 1368 bytes: with its headers within an Ethernet frame
+_TCP_PIECE: Final = 256
+_RETRY_S: Final = 0.5
+_REFUSED_S: Final = 2.0  # hosts tell of a closed port once a second at the most
+_LAST_SECOND_S: Final = 1.0
+
+_Resolved: TypeAlias = tuple[socket.AddressFamily, tuple[Any, ...]]
+
+
+class UdpSink(Sink):
+    """UDP to one receiver, or to a broadcast or multicast address.
+
+    Where nobody listens, the receiver's host tells so when the next packet goes; that packet is then sent
+    again, so that nothing is lost from the moment the receiver listens.
+
+    Parameters
+    ----------
+    url : str
+        ``udp://HOST:PORT``.
+
+    Raises
+    ------
+    InputError
+        No such address.
+    """
+
+    def __init__(self, url: str) -> None:
+        super().__init__(url)
+        family, self._address = _resolve(url, None, socket.SOCK_DGRAM)
+        self._backlog = Backlog(_UDP_PIECE)
+        self._trouble = ""
+        self._refused_until = 0.0
+        self._last = 0  # samples of the packet before
+        self._is_connected = False
+        self._retry_at = 0.0
+        self._socket = socket.socket(family, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        self.poll()
+
+    def publish(self, batch: Batch) -> None:
+        """Hand a batch on."""
+        if not self._is_connected:
+            self._backlog.dropped += len(batch.datagrams) // SIZE
+            return
+        try:
+            self._backlog.put(batch.datagrams, self._send)
+        except OSError as error:
+            self._lost(error)
+
+    def poll(self) -> None:
+        """Send what waits; look for the way again where there is none."""
+        try:
+            if self._is_connected:
+                self._backlog.flush(self._send)
+            elif time.monotonic() >= self._retry_at:
+                self._retry_at = time.monotonic() + _RETRY_S
+                self._socket.connect(self._address)
+                self._is_connected = True
+                self._trouble = ""
+        except OSError as error:
+            self._lost(error)
+
+    @property
+    def state(self) -> SinkState:
+        """How it is now."""
+        refused = "nobody listens" if time.monotonic() < self._refused_until else ""
+        trouble = self._trouble or refused
+        counts = self._backlog
+        return SinkState(self.url, trouble or "ok", not trouble, counts.sent, counts.dropped, counts.queued)
+
+    def close(self) -> None:
+        """Send what waits, for a second at the most, and let go."""
+        deadline = time.monotonic() + _LAST_SECOND_S
+        while self._backlog.queued and (left := deadline - time.monotonic()) > 0:
+            select.select([], [self._socket], [], left)
+            self.poll()
+        self._backlog.abandon()
+        self._socket.close()
+
+    def _send(self, packet: bytes) -> int:
+        try:
+            written = self._socket.send(packet)
+        except ConnectionRefusedError:
+            self._refused_until = time.monotonic() + _REFUSED_S
+            self._backlog.sent -= self._last
+            self._backlog.dropped += self._last
+            self._last = 0
+            written = self._socket.send(packet)
+        self._trouble = ""
+        self._last = written // SIZE
+        return written
+
+    def _lost(self, error: OSError) -> None:
+        """There is no way to the receiver; what waits would come too late."""
+        self._trouble = (error.strerror or str(error)).lower()
+        self._backlog.abandon()
+
+
+class _Client:
+    """One who connected, with what waits for it."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        connection.setblocking(False)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self.connection = connection
+        self.backlog = Backlog(_TCP_PIECE)
+
+    def put(self, datagrams: bytes) -> bool:
+        """Hand datagrams on; whether the client is still there."""
+        try:
+            self.backlog.put(datagrams, self.connection.send)
+        except OSError:
+            return False
+        return True
+
+    def look(self) -> bool:
+        """Send what waits and throw away what the client says; whether it is still there."""
+        try:
+            self.backlog.flush(self.connection.send)
+            return self.connection.recv(1 << 16) != b""
+        except BlockingIOError:
+            return True
+        except OSError:
+            return False
+
+
+class TcpSink(Sink):
+    """TCP server; each client has its own queue, and one that stops reading loses its own samples only.
+
+    A client that says it has nothing more to say is taken for gone.
+
+    Parameters
+    ----------
+    url : str
+        ``tcp://HOST:PORT``; without a host only this machine is served (127.0.0.1); port 0 takes a free one,
+        which the state tells.
+
+    Raises
+    ------
+    InputError
+        No such address, or one that cannot be had.
+    """
+
+    def __init__(self, url: str) -> None:
+        super().__init__(url)
+        family, address = _resolve(url, "127.0.0.1", socket.SOCK_STREAM)
+        self._clients: list[_Client] = []
+        self._sent = self._dropped = 0  # of clients that have gone
+        self._listener = socket.socket(family, socket.SOCK_STREAM)
+        try:
+            self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            self._listener.bind(address)
+            self._listener.listen(MAX_CLIENTS)
+        except OSError as error:
+            self._listener.close()
+            raise InputError(
+                f"{url}: expected an address of this machine and a free port, "
+                f"got: {error.strerror or error}; take another one"
+            ) from error
+        self._listener.setblocking(False)
+        host, port = self._listener.getsockname()[:2]
+        self._where = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+    def publish(self, batch: Batch) -> None:
+        """Hand a batch on."""
+        gone = [client for client in self._clients if not client.put(batch.datagrams)]
+        for client in gone:
+            self._part(client)
+
+    def poll(self) -> None:
+        """Take new clients, part from those that left, send what waits."""
+        for client in [client for client in self._clients if not client.look()]:
+            self._part(client)
+        for _ in range(MAX_CLIENTS):
+            try:
+                connection, _ = self._listener.accept()
+            except OSError:
+                return
+            if len(self._clients) < MAX_CLIENTS:
+                self._clients.append(_Client(connection))
+            else:
+                connection.close()
+
+    @property
+    def state(self) -> SinkState:
+        """How it is now."""
+        count = len(self._clients)
+        clients = "1 client" if count == 1 else f"{count} clients" if count else "waiting for a client"
+        counts = [client.backlog for client in self._clients]
+        return SinkState(
+            self.url,
+            f"{clients} on {self._where}",
+            True,
+            self._sent + sum(c.sent for c in counts),
+            self._dropped + sum(c.dropped for c in counts),
+            sum(c.queued for c in counts),
+        )
+
+    def close(self) -> None:
+        """Send what waits, for a second at the most, and let go."""
+        self._listener.close()
+        deadline = time.monotonic() + _LAST_SECOND_S
+        while waiting := [client for client in self._clients if client.backlog.queued]:
+            left = deadline - time.monotonic()
+            if left <= 0:
+                break
+            _, ready, _ = select.select([], [client.connection for client in waiting], [], left)
+            for client in waiting:
+                if client.connection in ready and not client.look():
+                    self._part(client)
+        for client in list(self._clients):
+            self._part(client)
+
+    def _part(self, client: _Client) -> None:
+        client.backlog.abandon()
+        client.connection.close()
+        self._clients.remove(client)
+        self._sent += client.backlog.sent
+        self._dropped += client.backlog.dropped
+
+
+def _resolve(url: str, default_host: str | None, kind: socket.SocketKind) -> _Resolved:
+    """Find the address that a URL means; without a default the host must be given."""
+    try:
+        parts = urlsplit(url)
+        host, port = parts.hostname or default_host, parts.port
+        if host is None or port is None or parts.path.strip("/") or parts.query:
+            raise ValueError("something else")
+    except ValueError as error:
+        raise InputError(f"{url}: expected {url.split(':')[0]}://HOST:PORT, got {error}") from error
+    try:
+        found = socket.getaddrinfo(host, port, type=kind)
+    except OSError as error:
+        raise InputError(
+            f"{url}: expected a host that this machine knows, got {host!r}: {error.strerror or error}; "
+            "check the name or give the address in numbers"
+        ) from error
+    family, _, _, _, address = found[0]
+    return family, address

@@ -1,0 +1,140 @@
+"""Datagrams on a serial line."""
+
+import os
+import termios
+import time
+from contextlib import suppress
+from threading import Thread
+from typing import Final
+
+import serial
+
+from imudrv import config
+from imudrv.errors import InputError
+from imudrv.ports.serial import explain
+from imudrv.ports.url import split, value
+from imudrv.profiles import SerialLine
+from imudrv.sinks.backlog import Backlog
+from imudrv.sinks.base import Batch, Sink, SinkState
+from imudrv.wire.datagram import SIZE
+
+BAUDRATE: Final = 921_600
+_PIECE: Final = 64
+_RETRY_S: Final = 1.0
+_LAST_SECOND_S: Final = 1.0
+
+
+class SerialSink(Sink):
+    """A serial port; where it is absent or unplugged it is opened again once it is there.
+
+    Opening may take a driver milliseconds, hence a thread does it.
+
+    Parameters
+    ----------
+    url : str
+        ``serial:///dev/ttyUSB1?baudrate=921600``, 8N1 unless ``bytesize``, ``parity``, ``stopbits`` say else.
+
+    Raises
+    ------
+    InputError
+        No path, or no such settings.
+    """
+
+    def __init__(self, url: str) -> None:
+        super().__init__(url)
+        self._path, self._line = _parse(url)
+        self._backlog = Backlog(_PIECE)
+        self._port: serial.Serial | None = None
+        self._trouble = "not open yet"
+        self._opening: Thread | None = None
+        self._retry_at = 0.0
+        self.poll()
+
+    def publish(self, batch: Batch) -> None:
+        """Hand a batch on."""
+        if self._port is None:
+            self._backlog.dropped += len(batch.datagrams) // SIZE
+            return
+        try:
+            self._backlog.put(batch.datagrams, self._write)
+        except OSError as error:
+            self._lose(error)
+
+    def poll(self) -> None:
+        """Send what waits; open the port again if it is lost."""
+        if self._port is not None:
+            try:
+                self._backlog.flush(self._write)
+            except OSError as error:
+                self._lose(error)
+        elif time.monotonic() >= self._retry_at and (self._opening is None or not self._opening.is_alive()):
+            self._retry_at = time.monotonic() + _RETRY_S
+            self._opening = Thread(target=self._open, daemon=True)
+            self._opening.start()
+
+    @property
+    def state(self) -> SinkState:
+        """How it is now."""
+        counts = self._backlog
+        is_open = self._port is not None
+        words = "ok" if is_open else self._trouble
+        return SinkState(self.url, words, is_open, counts.sent, counts.dropped, counts.queued)
+
+    def close(self) -> None:
+        """Send what waits, for a second at the most, and let go."""
+        deadline = time.monotonic() + _LAST_SECOND_S
+        if self._opening is not None:
+            self._opening.join(_LAST_SECOND_S)
+        while self._port is not None and self._backlog.queued and time.monotonic() < deadline:
+            self.poll()
+            time.sleep(0.005)
+        self._backlog.abandon()
+        self._let_go()
+
+    def _open(self) -> None:
+        parity = self._line.parity[0].upper()
+        try:
+            self._port = serial.Serial(
+                self._path,
+                self._line.baudrate,
+                self._line.bytesize,
+                parity,
+                self._line.stopbits,
+                timeout=0,
+                write_timeout=0,
+                exclusive=True,
+            )
+        except OSError as error:
+            self._trouble = explain(self._path, error)
+        except ValueError as error:  # a rate that the device does not have
+            self._trouble = str(error)
+
+    def _write(self, data: bytes) -> int:
+        # pyserial's own write would spin while the port takes nothing.
+        assert self._port is not None
+        return os.write(self._port.fileno(), data)
+
+    def _lose(self, error: OSError) -> None:
+        self._trouble = f"lost: {error.strerror or error}"
+        self._retry_at = time.monotonic() + _RETRY_S
+        self._backlog.abandon()
+        self._let_go()
+
+    def _let_go(self) -> None:
+        port, self._port = self._port, None
+        if port is None:
+            return
+        with suppress(OSError, termios.error):
+            termios.tcflush(port.fileno(), termios.TCOFLUSH)  # else closing waits for a line that is stuck
+        port.close()
+
+
+def _parse(url: str) -> tuple[str, SerialLine]:
+    parts = split(url)
+    if not parts.address.startswith("/"):
+        raise InputError(
+            f"{url}: expected the path of a device like serial:///dev/ttyUSB1 (three slashes), "
+            f"got {parts.address!r}"
+        )
+    options = {name: value(text) for name, text in parts.options.items()}
+    return parts.address, config.parse({"baudrate": BAUDRATE, **options}, SerialLine, url)

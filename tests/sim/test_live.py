@@ -1,0 +1,425 @@
+"""A scenario in real time, over real ptys, sockets and buses: what arrives is what the capture holds."""
+
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from queue import Queue
+from typing import Any
+
+import can
+import numpy as np
+import pytest
+
+from imudrv import profiles
+from imudrv.errors import InputError
+from imudrv.records import Records
+from imudrv.sim import links
+from imudrv.sim.capture import wire
+from imudrv.sim.live import MOST, Pace, Playback, Played, play, speed_of
+from imudrv.sim.scenario import Scenario
+
+Make = Callable[..., Scenario]
+RS422 = profiles.load("imu50-rs422")
+CAN = profiles.load("imu50-can")
+FAULTS = {
+    "stream": {"bit_flips": 0.02, "bytes_lost": 0.02, "frame_lost": 0.02, "frame_doubled": 0.02},
+    "can": {"lost": 0.02, "doubled": 0.02, "swapped": 0.02},
+    "silences": [{"at_s": 0.3, "duration_s": 0.2}],
+    "counter_jumps": [{"at_s": 0.7, "by": 100}],
+}
+GENEROUS_S = 20.0
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    # the readers here throw nothing away when they open a port
+    monkeypatch.setattr(links, "SETTLE_S", 0.02)
+
+
+@pytest.fixture
+def run(scenario: Make) -> Scenario:
+    return scenario({"rest": {"duration_s": 1.0}}, faults=FAULTS)
+
+
+def whole(scenario: Scenario, profile: profiles.Profile) -> bytes:
+    pieces = [piece.data for piece in wire(scenario, profile.layout())]
+    return b"".join(data for data in pieces if isinstance(data, bytes))
+
+
+class Player:
+    """A run in another thread, and what it says."""
+
+    def __init__(self, pool: ThreadPoolExecutor) -> None:
+        self._pool = pool
+        self.said: Queue[str] = Queue()
+        self.stop = threading.Event()
+        self.played: Future[Played] | None = None
+
+    def start(self, *arguments: Any, link: Path | None = None) -> str:
+        """Begin; where to listen."""
+        name = str(link) if link else None
+        self.played = self._pool.submit(play, *arguments, self.said.put, name, self.stop)
+        while self.said.empty():
+            if self.played.done():
+                self.played.result()
+            time.sleep(0.005)
+        return self.said.get().split()[-1]
+
+    def result(self) -> Played:
+        assert self.played is not None
+        return self.played.result(timeout=GENEROUS_S)
+
+
+@pytest.fixture
+def player() -> Iterator[Player]:
+    with ThreadPoolExecutor(1) as pool:
+        player = Player(pool)
+        yield player
+        player.stop.set()
+
+
+@contextmanager
+def opened(path: str | Path) -> Iterator[int]:
+    """A terminal, once it is there."""
+    deadline = time.monotonic() + GENEROUS_S
+    while not Path(path).exists() and time.monotonic() < deadline:
+        time.sleep(0.002)
+    fd = os.open(path, os.O_RDWR | os.O_NOCTTY)
+    try:
+        yield fd
+    finally:
+        os.close(fd)
+
+
+def read_to_the_end(fd: int) -> bytes:
+    data = b""
+    while select.select([fd], [], [], GENEROUS_S)[0]:
+        try:
+            piece = os.read(fd, 65536)
+        except OSError:
+            break
+        if not piece:
+            break
+        data += piece
+    return data
+
+
+@pytest.mark.parametrize("speed", [10.0, None])
+@pytest.mark.parametrize("profile", ["imu50-rs422", "imu50-rs422-acc"])
+def test_a_pty_carries_the_bytes_of_the_capture(
+    run: Scenario, player: Player, profile: str, speed: float | None
+) -> None:
+    wanted = whole(run, profiles.load(profile))
+    with opened(player.start(run, profiles.load(profile), "pty", speed)) as fd:
+        assert read_to_the_end(fd) == wanted
+    played = player.result()
+    assert (played.samples, played.sent, played.undelivered) == (1000, len(wanted), 0)
+    assert (played.latest_ns is None) == (speed is None)
+    assert "1000 samples" in str(played)
+
+
+def test_twenty_thousand_samples_a_second_pass_a_pty_without_loss(scenario: Make, player: Player) -> None:
+    run = scenario({"rest": {"duration_s": 20.0}})
+    with opened(player.start(run, RS422, "pty", 20.0)) as fd:
+        assert read_to_the_end(fd) == whole(run, RS422)
+    assert player.result().undelivered == 0
+
+
+def test_a_pty_waits_for_its_reader_however_late(run: Scenario, player: Player) -> None:
+    path = player.start(run, RS422, "pty", 1000.0)
+    time.sleep(0.3)
+    with opened(path) as fd:
+        assert read_to_the_end(fd) == whole(run, RS422)
+
+
+def test_an_unplugged_pty_comes_back_under_its_link(scenario: Make, player: Player, tmp_path: Path) -> None:
+    out = [{"at_s": 0.2, "duration_s": 0.1}, {"at_s": 0.6, "duration_s": 0.1}]
+    run = scenario({"rest": {"duration_s": 1.0}}, faults={**FAULTS, "unplugs": out})
+    link = tmp_path / "imu"
+    assert player.start(run, RS422, "pty", None, link=link) == str(link)
+    got, slaves = [], []
+    for _ in range(3):
+        with opened(link) as fd:
+            slaves.append(os.readlink(link))
+            got.append(read_to_the_end(fd))
+    # A reader that waits for the pty gets all that the capture has: there the cable's time is a silence.
+    assert b"".join(got) == whole(run, RS422)
+    assert all(got)
+    assert player.result().undelivered == 0
+    assert not link.is_symlink()
+    silent = run.model_copy(update={"faults": run.faults.model_copy(update={"unplugs": ()})})
+    assert len(whole(silent, RS422)) > len(whole(run, RS422))
+
+
+def test_in_real_time_the_unit_goes_on_without_a_reader_and_says_so(scenario: Make, player: Player) -> None:
+    run = scenario({"rest": {"duration_s": 1.0}}, faults={"unplugs": [{"at_s": 0.5, "duration_s": 0.1}]})
+    with opened(player.start(run, RS422, "pty", 5.0)) as fd:
+        first = read_to_the_end(fd)
+    played = player.result()
+    assert first == whole(run, RS422)[: 500 * 44]
+    assert played.sent == len(first)
+    assert played.undelivered == len(whole(run, RS422)) - len(first) == 400 * 44
+    assert "17600 not delivered" in str(played)
+
+
+def test_what_a_reader_leaves_at_the_end_is_not_delivered(
+    scenario: Make, player: Player, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(links, "PATIENCE_S", 0.1)
+    run = scenario({"rest": {"duration_s": 0.01}})
+    with opened(player.start(run, RS422, "pty", 10.0)):
+        played = player.result()
+    assert (played.sent, played.undelivered) == (0, 440)
+
+
+def test_a_link_never_takes_the_place_of_a_file(run: Scenario, player: Player, tmp_path: Path) -> None:
+    (tmp_path / "imu").write_text("precious")
+    with pytest.raises(InputError, match="expected a name that is free"):
+        player.start(run, RS422, "pty", None, link=tmp_path / "imu")
+    with pytest.raises(InputError, match="cannot be made"):
+        player.start(run, RS422, "pty", None, link=tmp_path / "no" / "imu")
+    assert (tmp_path / "imu").read_text() == "precious"
+
+
+def test_a_serial_port_is_set_as_the_profile_says_and_closed_when_unplugged(
+    scenario: Make, player: Player
+) -> None:
+    run = scenario({"rest": {"duration_s": 0.2}}, faults={"unplugs": [{"at_s": 0.1, "duration_s": 0.05}]})
+    master, slave = os.openpty()
+    path = os.ttyname(slave)
+    wanted = whole(run, RS422)
+    try:
+        assert player.start(run, RS422, f"serial://{path}?baudrate=460800", 10.0) == path
+        got = b""
+        while len(got) < len(wanted) and select.select([master], [], [], GENEROUS_S)[0]:
+            got += os.read(master, 65536)
+        assert got == wanted
+        assert player.result().undelivered == 0
+    finally:
+        os.close(master)
+        os.close(slave)
+
+
+def test_a_serial_port_that_goes_away_ends_the_run_with_a_message(scenario: Make, player: Player) -> None:
+    master, slave = os.openpty()
+    player.start(scenario({"rest": {"duration_s": 60.0}}), RS422, os.ttyname(slave), 1.0)
+    os.read(master, 44)
+    os.close(slave)
+    os.close(master)
+    with pytest.raises(InputError, match="the port went away"):
+        player.result()
+
+
+def connect(where: str) -> socket.socket:
+    host, port = where.removeprefix("tcp://").rsplit(":", 1)
+    deadline = time.monotonic() + GENEROUS_S
+    while True:
+        try:
+            return socket.create_connection((host, int(port)), timeout=GENEROUS_S)
+        except ConnectionRefusedError:
+            # unplugged just now
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.005)
+
+
+def receive_to_the_end(client: socket.socket) -> bytes:
+    data = b""
+    while piece := client.recv(65536):
+        data += piece
+    return data
+
+
+@pytest.mark.parametrize("speed", [10.0, None])
+def test_a_tcp_client_gets_the_bytes_of_the_capture(
+    run: Scenario, player: Player, speed: float | None
+) -> None:
+    with connect(player.start(run, RS422, "tcp://:0", speed)) as client:
+        assert receive_to_the_end(client) == whole(run, RS422)
+    assert player.result().undelivered == 0
+
+
+def test_a_second_tcp_client_gets_what_comes_from_then_on(scenario: Make, player: Player) -> None:
+    run = scenario({"rest": {"duration_s": 1.0}})
+    where = player.start(run, RS422, "tcp://127.0.0.1:0", 2.0)
+    with connect(where) as first:
+        begun = first.recv(44)
+        with connect(where) as second:
+            late = receive_to_the_end(second)
+        early = begun + receive_to_the_end(first)
+    assert early == whole(run, RS422)
+    assert late
+    assert early.endswith(late)
+
+
+def test_an_unplugged_tcp_server_closes_and_listens_again(scenario: Make, player: Player) -> None:
+    run = scenario({"rest": {"duration_s": 1.0}}, faults={"unplugs": [{"at_s": 0.5, "duration_s": 0.1}]})
+    where = player.start(run, RS422, "tcp://:0", None)
+    with connect(where) as client:
+        first = receive_to_the_end(client)
+    with connect(where) as client:
+        second = receive_to_the_end(client)
+    assert first + second == whole(run, RS422)
+    assert len(first) == 500 * 44
+
+
+def test_a_tcp_client_that_reads_nothing_is_cut_off_and_costs_the_others_nothing(
+    scenario: Make, player: Player, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(links, "PATIENCE_S", 0.1)
+    run = scenario({"rest": {"duration_s": 200.0}})
+    where = player.start(run, RS422, "tcp://:0", 1000.0)
+    with connect(where) as deaf, connect(where) as client:
+        # 8.8 MB are more than the system keeps for a connection
+        got = receive_to_the_end(client)
+        assert whole(run, RS422).endswith(got)
+        assert player.said.get() == "a client takes nothing; 1 left"
+        assert deaf.recv(1)
+    assert player.result().undelivered > 0
+
+
+def test_without_a_tcp_client_nothing_is_delivered(scenario: Make, player: Player) -> None:
+    run = scenario({"rest": {"duration_s": 1.0}})
+    with connect(player.start(run, RS422, "tcp://:0", 5.0)) as client:
+        client.recv(44)
+    played = player.result()
+    assert played.sent > 0
+    assert played.undelivered > 0
+    assert played.sent + played.undelivered == 44_000
+    assert player.said.get() == "a client has gone; 0 left"
+
+
+def messages_of(run: Scenario, profile: profiles.Profile) -> list[tuple[int, bytes, bool]]:
+    pieces: list[Records] = [p.data for p in wire(run, profile.layout()) if not isinstance(p.data, bytes)]
+    return [(int(m["id"]), m["data"][: m["length"]].tobytes(), bool(m["fd"])) for m in np.concatenate(pieces)]
+
+
+@pytest.mark.parametrize("profile", ["imu50-can", "imu50-canfd"])
+@pytest.mark.parametrize("bus", ["virtual/live", "udp_multicast/239.74.163.9?port=43219"])
+def test_a_can_bus_carries_the_messages_of_the_capture(
+    run: Scenario, player: Player, profile: str, bus: str
+) -> None:
+    loaded = profiles.load(profile)
+    wanted = messages_of(run, loaded)
+    interface, _, rest = bus.partition("/")
+    channel, _, query = rest.partition("?port=")
+    options: dict[str, Any] = {"port": int(query)} if query else {}
+    with can.Bus(interface=interface, channel=channel, ignore_config=True, **options) as listener:
+        player.start(run, loaded, f"can://{bus}", 2.0)
+        got = []
+        while len(got) < len(wanted) and (message := listener.recv(GENEROUS_S)) is not None:
+            got.append((message.arbitration_id, bytes(message.data), message.is_fd))
+    assert got == wanted
+    played = player.result()
+    assert (played.sent, played.undelivered, played.unit) == (len(wanted), 0, "messages")
+
+
+@pytest.mark.parametrize(
+    ("target", "profile", "message"),
+    [
+        ("pty", CAN, "expected can://INTERFACE/CHANNEL for the profile imu50-can"),
+        ("can://virtual/x", RS422, "expected pty, a serial port or tcp:// for the profile imu50-rs422"),
+        ("can://nonsense/x", CAN, "cannot be opened as a CAN bus"),
+        ("/dev/no-such-port", RS422, "/dev/no-such-port: cannot be opened as a serial port"),
+        ("serial:///dev/x?colour=red", RS422, "expected pty, a serial port's path"),
+        ("serial:///dev/x?baudrate=fast", RS422, "fast"),
+        ("tcp://127.0.0.1:99999", RS422, "(?i)port"),
+        ("tcp://192.0.2.1:5000", RS422, "cannot listen there"),
+        ("udp://127.0.0.1:5000", RS422, "expected pty, a serial port's path"),
+    ],
+)
+def test_a_target_without_sense_is_refused(
+    run: Scenario, player: Player, target: str, profile: profiles.Profile, message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        player.start(run, profile, target, None)
+
+
+def test_a_link_goes_with_a_pty_alone(run: Scenario, player: Player, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="only with the port pty"):
+        player.start(run, RS422, "tcp://:0", None, link=tmp_path / "imu")
+
+
+def test_a_stop_ends_the_run_with_its_books(scenario: Make, player: Player) -> None:
+    run = scenario({"rest": {"duration_s": 3600.0}})
+    with opened(player.start(run, RS422, "pty", 1.0)) as fd:
+        os.read(fd, 44)
+        player.stop.set()
+        read_to_the_end(fd)
+    played = player.result()
+    assert 0 < played.samples < 3600_000
+    assert played.sent + played.undelivered == 44 * played.samples
+
+
+def test_a_stop_ends_the_wait_for_a_reader(run: Scenario, player: Player) -> None:
+    player.start(run, RS422, "pty", 1.0)
+    player.stop.set()
+    assert player.result().samples == 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_process_cleanly(number: signal.Signals, tmp_path: Path) -> None:
+    program = (
+        "import sys; from functools import partial; from imudrv import profiles; "
+        "from imudrv.sim import live, scenario; "
+        "print(live.play(scenario.load('static'), profiles.load('imu50-rs422'), 'pty', 1.0, "
+        "partial(print, flush=True), sys.argv[1]))"
+    )
+    link = tmp_path / "imu"
+    process = subprocess.Popen([sys.executable, "-c", program, str(link)], stdout=subprocess.PIPE, text=True)
+    try:
+        with opened(link) as fd:
+            os.read(fd, 44)
+            process.send_signal(number)
+            read_to_the_end(fd)
+        said, _ = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 0
+    assert " 0 not delivered" in said
+    assert not link.is_symlink()
+
+
+def test_playback_gives_what_is_due_and_no_more(run: Scenario) -> None:
+    layout = RS422.layout()
+    playback = Playback(run, layout)
+    assert playback.due_ns() == 1_000_000
+    assert playback.due_ns(group=10) == 10_000_000
+    assert playback.take(999_999) is None
+    pieces = []
+    for until_ns in range(0, 2_000_000_000, 7_000_000):
+        while (due := playback.take(until_ns)) is not None:
+            assert due.first_ns <= due.last_ns <= until_ns
+            assert due.last_ns - due.first_ns < MOST * layout.interval_ns
+            pieces.append(due.data)
+        assert (playback.due_ns() or 2**62) > until_ns
+    assert playback.due_ns() is None
+    assert b"".join(pieces) == whole(run, RS422)  # type: ignore[arg-type]
+
+
+def test_deadlines_are_absolute(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = [5_000]
+    monkeypatch.setattr(time, "monotonic_ns", lambda: clock[0])
+    pace = Pace(2.0)
+    clock[0] += 1_500_000
+    assert pace.now_ns() == 3_000_000
+    assert pace.left_ns(4_000_000) == 500_000
+    assert pace.left_ns(2_000_000) == -500_000
+    assert Pace(None).now_ns() > 10**18
+    assert Pace(None).left_ns(10**15) == 0
+
+
+def test_a_speed_is_a_number_or_max() -> None:
+    assert [speed_of(text) for text in ("1", "0.5", "10", "max")] == [1.0, 0.5, 10.0, None]
+    for text in ("0", "-1", "nan", "fast", "1e9"):
+        with pytest.raises(InputError, match="expected max or a number from"):
+            speed_of(text)

@@ -1,0 +1,133 @@
+import threading
+
+import can
+import numpy as np
+import pytest
+
+from imudrv import profiles
+from imudrv.errors import InputError
+from imudrv.imu.accounting import Accountant
+from imudrv.records import MESSAGE, Records
+from imudrv.sinks import can as can_sink
+from imudrv.sinks.can import CanSink
+from imudrv.wire.can import CanAssembler
+
+SERIAL = profiles.load("imu50-rs422").layout()
+
+
+def receive(bus: can.BusABC, count: int) -> Records:
+    messages = np.zeros(count, MESSAGE)
+    for row in messages:
+        message = bus.recv(20)
+        assert message is not None, "the sink stopped sending"
+        row["id"], row["length"], row["fd"] = message.arbitration_id, message.dlc, message.is_fd
+        row["data"][: message.dlc] = list(message.data)
+    return messages
+
+
+@pytest.mark.parametrize(("profile", "messages"), [("imu50-can", 2 * 200 + 2 * 2), ("imu50-canfd", 200)])
+def test_pulses_of_a_serial_unit_go_out_on_a_can_bus(batch, wait_for, profile: str, messages: int) -> None:
+    layout = profiles.load(profile).layout()
+    with can.Bus(f"gateway {profile}", "virtual", protocol=protocol(layout.fd)) as bus:
+        sink = CanSink(f"can://virtual/gateway {profile}?profile={profile}", SERIAL)
+        wait_for(lambda: sink.state.state == "ok")
+        sent = batch(0, 200)
+        sink.publish(sent)
+        decoded = CanAssembler(layout).feed(receive(bus, messages))
+        assert decoded.rejects.size == 0
+        pulses = Accountant(layout).feed(decoded.frames)
+        for name in ("counter", "gyro", "accelerometer"):
+            assert np.array_equal(pulses[name], sent.pulses[name])
+        # 0.01 degC is the wire's resolution.
+        assert pulses["temperature_degc"][-1, :4] == pytest.approx([35.12, 34.95, 35.01, 34.88], abs=0.005)
+        wait_for(lambda: sink.state[1:] == ("ok", True, 200, 0, 0))
+        sink.close()
+
+
+def protocol(fd: bool) -> can.CanProtocol:
+    return can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
+
+
+def test_what_the_outgoing_profile_cannot_say_is_dropped_and_counted(batch, wait_for) -> None:
+    with can.Bus("narrow", "virtual") as bus:
+        sink = CanSink("can://virtual/narrow?profile=imu50-can", SERIAL)
+        wait_for(lambda: sink.state.state == "ok")
+        sent = batch(1, 5)
+        sent.pulses["gyro"][1, 2] = 40_000  # more than 16 bits
+        sent.pulses["interval_ns"][3] = 3_000_000  # bridged a gap
+        sink.publish(sent)
+        counters = [int.from_bytes(m["data"][6:8].tobytes(), "little") for m in receive(bus, 6)]
+        assert counters == [1, 1, 3, 3, 5, 5]
+        wait_for(lambda: sink.state[1:] == ("ok", True, 3, 2, 0))
+        sink.close()
+
+
+def test_temperatures_go_by_what_they_measure() -> None:
+    have = ("gyro", "accelerometer", "electronics")
+    want = ("gyro", "accelerometer_x", "accelerometer_y", "accelerometer_z")
+    assert can_sink._related(have, want) == [[0], [1], [1], [1]]
+    assert can_sink._related(want, have) == [[0], [1, 2, 3], []]
+
+
+def test_a_driver_that_blocks_holds_nobody_and_costs_the_oldest_samples(batch, wait_for, monkeypatch) -> None:
+    go, begun = threading.Event(), threading.Event()
+    send = can.interfaces.virtual.VirtualBus.send
+
+    def slow(self: can.BusABC, message: can.Message, timeout: float | None = None) -> None:
+        begun.set()
+        assert go.wait(20)
+        send(self, message, timeout)
+
+    monkeypatch.setattr(can.interfaces.virtual.VirtualBus, "send", slow)
+    monkeypatch.setattr(can_sink, "LIMIT", 50)
+    with can.Bus("slow", "virtual") as bus:
+        sink = CanSink("can://virtual/slow?profile=imu50-canfd", SERIAL)
+        wait_for(lambda: sink.state.state == "ok")
+        sink.publish(batch(0, 1))
+        assert begun.wait(20)
+        for n in range(1, 100):
+            sink.publish(batch(n, 1))
+        assert sink.state[3:] == (0, 50, 50)
+        go.set()
+        counters = [int.from_bytes(m["data"][:4].tobytes(), "little") for m in receive(bus, 50)]
+        assert counters == [0, *range(51, 100)], "the first was in hand already"
+        wait_for(lambda: sink.state.sent == 50)
+        sink.close()
+
+
+def test_a_bus_that_is_not_there_or_fails_is_told_and_opened_again(batch, wait_for, monkeypatch) -> None:
+    monkeypatch.setattr(can_sink, "_RETRY_S", 0.05)
+    broken = True
+    send = can.interfaces.virtual.VirtualBus.send
+
+    def failing(self: can.BusABC, message: can.Message, timeout: float | None = None) -> None:
+        if broken:
+            raise can.CanOperationError("transmit queue full")
+        send(self, message, timeout)
+
+    monkeypatch.setattr(can.interfaces.virtual.VirtualBus, "send", failing)
+    with can.Bus("failing", "virtual") as bus:
+        sink = CanSink("can://virtual/failing?profile=imu50-can", SERIAL)
+        wait_for(lambda: sink.state.state == "ok")
+        sink.publish(batch(1, 10))
+        wait_for(lambda: sink.state.dropped == 10)
+        broken = False
+        wait_for(lambda: sink.state.state == "ok")
+        sink.publish(batch(11, 1))
+        receive(bus, 2)
+        wait_for(lambda: sink.state[1:] == ("ok", True, 1, 10, 0))
+        sink.close()
+
+
+@pytest.mark.parametrize(
+    ("url", "told"),
+    [
+        ("can://virtual/x", r"expected the outgoing profile.*profile=imu50-can"),
+        ("can://virtual/x?profile=imu50-rs422", "expected a port for the serial profile"),
+        ("can://nothing/x?profile=imu50-can", "expected an interface of python-can"),
+        ("can://virtual/x?profile=tools/psins-100hz.yaml", "psins-100hz"),
+    ],
+)
+def test_a_gateway_that_cannot_be_is_refused(url: str, told: str) -> None:
+    with pytest.raises(InputError, match=told):
+        CanSink(url, SERIAL)

@@ -1,0 +1,231 @@
+import socket
+from collections.abc import Iterator
+from contextlib import suppress
+
+import numpy as np
+import pytest
+
+from imudrv.errors import InputError
+from imudrv.sinks.backlog import LIMIT
+from imudrv.sinks.network import MAX_CLIENTS, TcpSink, UdpSink
+from imudrv.wire.datagram import SIZE, DatagramDecoder
+
+
+def receiver() -> socket.socket:
+    udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    udp.bind(("127.0.0.1", 0))
+    udp.settimeout(20)
+    return udp
+
+
+def port_of(sink: TcpSink) -> int:
+    return int(sink.state.state.rpartition(":")[2])
+
+
+def connect(sink: TcpSink, wait_for) -> socket.socket:
+    before = len(sink._clients)
+    client = socket.create_connection(("127.0.0.1", port_of(sink)), timeout=20)
+    wait_for(lambda: sink.poll() or len(sink._clients) > before)
+    return client
+
+
+def read(client: socket.socket, samples: int) -> bytes:
+    data = b""
+    while len(data) < samples * SIZE:
+        piece = client.recv(samples * SIZE - len(data))
+        assert piece, "the sink hung up"
+        data += piece
+    return data
+
+
+def counters(data: bytes) -> list[int]:
+    received = DatagramDecoder().feed(data)
+    assert received.rejects.size == 0
+    assert len(received.increments) * SIZE == len(data)
+    return received.increments["counter"].tolist()
+
+
+@pytest.fixture
+def tcp() -> Iterator[TcpSink]:
+    sink = TcpSink("tcp://:0")
+    yield sink
+    sink.close()
+
+
+def test_udp_brings_every_sample_in_order_in_packets_that_no_network_splits(batch) -> None:
+    with receiver() as udp:
+        sink = UdpSink(f"udp://127.0.0.1:{udp.getsockname()[1]}")
+        for first in range(10):
+            sink.publish(batch(first, 1))
+        late = batch(10, 50)
+        sink.publish(late)
+        packets = [udp.recv(65536) for _ in range(13)]
+        assert counters(b"".join(packets)) == list(range(60))
+        assert [len(packet) // SIZE for packet in packets] == [1] * 10 + [18, 18, 14]
+        assert max(map(len, packets)) < 1400
+        assert b"".join(packets[10:]) == late.datagrams
+        assert sink.state[1:] == ("ok", True, 60, 0, 0)
+        sink.close()
+
+
+def test_nothing_is_lost_from_the_moment_a_udp_receiver_is_there(batch) -> None:
+    with receiver() as udp:
+        port = udp.getsockname()[1]
+    sink = UdpSink(f"udp://127.0.0.1:{port}")
+    for n in range(100):
+        sink.publish(batch(n, 1))
+    state = sink.state
+    assert (state.state, state.healthy) == ("nobody listens", False)
+    assert state.sent + state.dropped == 100
+    assert state.sent <= 1, "of the last one nothing has been heard yet"
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
+        udp.bind(("127.0.0.1", port))
+        udp.settimeout(20)
+        for n in range(100, 120):
+            sink.publish(batch(n, 1))
+        assert counters(b"".join(udp.recv(65536) for _ in range(20))) == list(range(100, 120))
+    assert sink.state.sent == 20
+    assert sink.state.dropped == 100
+    sink.close()
+
+
+def test_a_network_that_is_not_there_is_told_and_costs_samples_only(batch, monkeypatch) -> None:
+    sink = UdpSink("udp://127.0.0.1:9")
+    sink._is_connected = False
+
+    class Away:
+        def connect(self, address: object) -> None:
+            raise OSError(101, "Network is unreachable")
+
+        def close(self) -> None:
+            pass
+
+    really, sink._socket = sink._socket, Away()
+    sink._retry_at = 0.0
+    sink.poll()
+    sink.publish(batch(0, 5))
+    assert sink.state[1:] == ("network is unreachable", False, 0, 5, 0)
+    sink._socket = really
+    sink._retry_at = 0.0
+    sink.poll()
+    assert sink.state.state == "ok"
+    sink.close()
+
+
+@pytest.mark.parametrize(
+    "url", ["udp://", "udp://host", "udp://127.0.0.1:99999", "udp://:5000", "udp://h:1/x"]
+)
+def test_a_udp_address_that_makes_no_sense_is_refused(url: str) -> None:
+    with pytest.raises(InputError, match="expected udp://HOST:PORT"):
+        UdpSink(url)
+
+
+def test_a_host_that_nobody_knows_is_refused() -> None:
+    with pytest.raises(InputError, match=r"no-such-host\.invalid.*check the name"):
+        UdpSink("udp://no-such-host.invalid:5000")
+
+
+def test_tcp_serves_this_machine_only_unless_told_otherwise(tcp: TcpSink) -> None:
+    assert tcp.state.state.startswith("waiting for a client on 127.0.0.1:")
+    assert tcp.state.healthy
+    assert tcp._listener.getsockname()[0] == "127.0.0.1"
+
+
+def test_tcp_brings_every_client_every_sample_from_its_coming_on(tcp: TcpSink, batch, wait_for) -> None:
+    tcp.publish(batch(0, 1))
+    with connect(tcp, wait_for) as one:
+        tcp.publish(batch(1, 1))
+        with connect(tcp, wait_for) as two:
+            assert tcp.state.state.startswith("2 clients on")
+            tcp.publish(batch(2, 100))
+            assert counters(read(one, 101)) == list(range(1, 102))
+            assert counters(read(two, 100)) == list(range(2, 102))
+    assert tcp.state[3:] == (201, 0, 0)
+
+
+def test_a_tcp_client_that_stops_reading_loses_its_own_oldest_samples_and_no_one_elses(
+    tcp: TcpSink, batch, wait_for
+) -> None:
+    samples = 60_000  # 4.6 MB: more than our queue and the system's buffers hold, the sender's being limited
+    got = bytearray()
+    with connect(tcp, wait_for) as stuck, connect(tcp, wait_for) as good:
+        tcp._clients[0].connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 16)
+        good.setblocking(False)
+
+        def take() -> int:
+            with suppress(BlockingIOError):
+                got.extend(good.recv(1 << 20))
+            return len(got)
+
+        for first in range(0, samples, 100):
+            tcp.publish(batch(first, 100))
+            take()
+        wait_for(lambda: tcp.poll() or take() == samples * SIZE)
+        assert counters(bytes(got)) == list(range(samples))
+        state = tcp.state
+        assert state.dropped > 0
+        assert LIMIT <= state.queued <= LIMIT + 1, "one may be half out"
+        assert state.sent + state.dropped + state.queued == 2 * samples
+        # It reads again: what it has missed is a gap between whole datagrams, the newest are all there.
+        stuck.settimeout(20)
+        rest = bytearray()
+        while len(rest) < (samples - state.dropped) * SIZE:
+            rest += stuck.recv(1 << 20)
+            tcp.poll()
+        numbers = counters(bytes(rest))
+        assert len(numbers) == samples - state.dropped
+        assert numbers[-LIMIT:] == list(range(samples - LIMIT, samples))
+        assert np.all(np.diff(numbers) > 0)
+    assert tcp.state.queued == 0
+
+
+def test_tcp_clients_come_and_go_and_talk_in_vain(tcp: TcpSink, batch, wait_for) -> None:
+    for n in range(5):
+        with connect(tcp, wait_for) as client:
+            client.sendall(b"GET / HTTP/1.0\r\n\r\n" * 1000)
+            tcp.poll()
+            tcp.publish(batch(n, 1))
+            assert counters(read(client, 1)) == [n]
+        wait_for(lambda: tcp.poll() or not tcp._clients)
+    assert tcp.state.sent == 5
+    assert tcp.state.state.startswith("waiting for a client")
+
+
+def test_a_tcp_client_that_was_killed_is_found_out_by_writing(tcp: TcpSink, batch, wait_for) -> None:
+    client = connect(tcp, wait_for)
+    client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")  # close with a reset
+    client.close()
+    wait_for(lambda: tcp.publish(batch(0, 1)) or not tcp._clients)
+
+
+def test_more_tcp_clients_than_there_is_room_for_are_sent_away(tcp: TcpSink, wait_for) -> None:
+    clients = [connect(tcp, wait_for) for _ in range(MAX_CLIENTS)]
+    with socket.create_connection(("127.0.0.1", port_of(tcp)), timeout=20) as late:
+        tcp.poll()
+        assert late.recv(1) == b""
+    assert tcp.state.state.startswith(f"{MAX_CLIENTS} clients")
+    for client in clients:
+        client.close()
+
+
+def test_closing_a_tcp_sink_sends_what_waits(batch, wait_for) -> None:
+    sink = TcpSink("tcp://127.0.0.1:0")
+    with connect(sink, wait_for) as client:
+        sink._clients[0].backlog._whole += batch(0, 3).datagrams
+        sink.close()
+        assert counters(read(client, 3)) == [0, 1, 2]
+        assert client.recv(1) == b""
+    assert sink.state[3:] == (3, 0, 0)
+
+
+def test_a_port_that_is_taken_is_refused_before_the_start(tcp: TcpSink) -> None:
+    with pytest.raises(InputError, match="expected an address of this machine and a free port"):
+        TcpSink(f"tcp://127.0.0.1:{port_of(tcp)}")
+
+
+def test_a_host_given_is_the_one_that_is_served() -> None:
+    sink = TcpSink("tcp://0.0.0.0:0")
+    assert "on 0.0.0.0:" in sink.state.state
+    sink.close()
+    with pytest.raises(InputError, match="expected an address of this machine"):
+        TcpSink("tcp://192.0.2.1:0")

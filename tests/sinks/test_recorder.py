@@ -1,0 +1,322 @@
+import errno
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import NonSeekingReader, make_reader
+
+from imudrv import profiles
+from imudrv.errors import InputError
+from imudrv.ports.base import Arrival
+from imudrv.recording import Recording
+from imudrv.records import MESSAGE
+from imudrv.sinks import recorder as recorder_module
+from imudrv.sinks.recorder import Recorder
+from imudrv.wire.datagram import SIZE, Source
+
+PROFILES = Path(profiles.__file__).parent
+
+
+def open_recorder(
+    path: Path, profile: str = "imu50-rs422", calibration: bytes | None = b"one: 1\n"
+) -> Recorder:
+    return Recorder(
+        path,
+        layout=profiles.load(profile).layout(),
+        profile=(PROFILES / f"{profile}.yaml").read_bytes(),
+        calibration=calibration,
+        source=Source.SIMULATOR,
+        port="sim://x.yaml",
+        unit="50-0017",
+    )
+
+
+def test_the_library_itself_reads_all_that_was_recorded(batch, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    recorder = open_recorder(path)
+    for n in range(20):
+        recorder.arrived(Arrival(1000 + n, bytes([n]) * 44))
+        recorder.publish(batch(n, 1))
+    recorder.arrived(Arrival(2000, b""))
+    recorder.status({"rate_hz": 1000.0, "path": Path("x")})
+    recorder.event(3000, "unplugged")
+    recorder.calibration(4000, b"two: 2\n")
+    recorder.close()
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        assert reader.get_header().library == "imu50 0.1.0"
+        summary = reader.get_summary()
+        assert summary is not None
+        assert [c.topic for c in summary.channels.values()] == [
+            "/imu50/wire",
+            "/imu50/increments",
+            "/imu50/status",
+            "/imu50/events",
+        ]
+        (origin,) = reader.iter_metadata()
+        assert origin.metadata["unit"] == "50-0017"
+        assert origin.metadata["source"] == "simulator"
+        attachments = list(reader.iter_attachments())
+        assert [(a.name, a.data[:6]) for a in attachments[1:]] == [
+            ("calibration.yaml", b"one: 1"),
+            ("calibration.yaml", b"two: 2"),
+        ]
+        assert attachments[0].data == (PROFILES / "imu50-rs422.yaml").read_bytes()
+        assert attachments[2].log_time == 4000
+        messages = list(reader.iter_messages(log_time_order=False))
+    wire = [m for _, c, m in messages if c.topic == "/imu50/wire"]
+    assert [(m.log_time, m.data) for m in wire] == [(1000 + n, bytes([n]) * 44) for n in range(20)]
+    assert [m.sequence for m in wire] == list(range(20))
+    increments = b"".join(m.data for _, c, m in messages if c.topic == "/imu50/increments")
+    assert increments == batch(0, 20).datagrams
+    documents = {c.topic: (s.encoding, json.loads(m.data)) for s, c, m in messages if s}
+    assert documents["/imu50/status"] == ("jsonschema", {"rate_hz": 1000.0, "path": "x"})
+    assert documents["/imu50/events"] == ("jsonschema", {"text": "unplugged"})
+    with path.open("rb") as file:
+        assert len(list(NonSeekingReader(file).iter_messages())) == len(messages)
+
+
+def test_can_messages_come_back_exactly(batch, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    recorder = open_recorder(path, "imu50-canfd", None)
+    rng = np.random.default_rng(1)
+    sent = []
+    for n in range(30):
+        messages = np.zeros(rng.integers(1, 4), MESSAGE)
+        for row in messages:
+            row["t_ns"], row["id"] = 10**18 + n, rng.integers(0, 2**29)
+            row["length"], row["fd"] = rng.choice([0, 1, 8, 48, 64]), rng.integers(0, 2)
+            row["data"][: row["length"]] = rng.integers(0, 256, row["length"])
+        sent.append(messages)
+        recorder.arrived(Arrival(10**18 + n, messages))
+    recorder.close()
+    recording = Recording(path)
+    got = list(recording.arrivals())
+    assert [a.t_ns for a in got] == [10**18 + n for n in range(30)]
+    for arrival, messages in zip(got, sent, strict=True):
+        assert np.array_equal(arrival.data, messages)
+    assert recording.calibration_text is None
+    assert recording.profile.name == "imu50-canfd"
+
+
+def test_wire_bytes_stand_before_what_was_made_of_them(batch, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    recorder = open_recorder(path)
+    for n in range(5):
+        recorder.publish(batch(n, 1))
+        recorder.arrived(Arrival(n, b"x"))
+    recorder.close()
+    with path.open("rb") as file:
+        topics = [c.topic for _, c, _ in make_reader(file).iter_messages(log_time_order=False)]
+    assert topics == ["/imu50/wire"] * 5 + ["/imu50/increments"]
+
+
+def test_a_recording_that_exists_is_not_touched(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_bytes(b"mine")
+    with pytest.raises(InputError, match=r"run\.mcap: expected a new file.*another name"):
+        open_recorder(path)
+    assert path.read_bytes() == b"mine"
+
+
+def test_a_full_disk_is_told_and_passes_without_spoiling_the_file(
+    batch, wait_for, tmp_path: Path, monkeypatch
+) -> None:
+    room = 12_000
+    write = os.write
+
+    def full(descriptor: int, data: memoryview) -> int:
+        """Takes a part of what does not fit, as disks do."""
+        nonlocal room
+        if room == 0:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        written = write(descriptor, data[:room])
+        room -= written
+        return written
+
+    monkeypatch.setattr(os, "write", full)
+    monkeypatch.setattr(recorder_module, "QUEUE_BYTES", 300 * 140)
+    path = tmp_path / "run.mcap"
+    recorder = open_recorder(path)
+    put = 0
+    while recorder.state.state == "ok":
+        recorder.arrived(Arrival(put, b"%044d" % put))
+        recorder.publish(batch(put, 1))
+        put += 1
+        time.sleep(0.001)
+    assert not recorder.state.healthy
+    while "reads of the port lost" not in recorder.state.state or recorder.state.dropped < 100:
+        recorder.arrived(Arrival(put, b"%044d" % put))
+        recorder.publish(batch(put, 1))
+        put += 1
+    assert recorder.state.state.startswith("disk full; ")
+    state = recorder.state
+    assert state.sent + state.dropped + state.queued == put
+    cut = Recording(path)
+    assert cut.cut
+    assert cut.profile.name == "imu50-rs422"
+    before = [int(a.data) for a in cut.arrivals()]
+    assert before == list(range(len(before)))
+
+    room = 10**9
+    wait_for(lambda: recorder.state.queued == 0)
+    recorder.poll()
+    recorder.close()
+    assert recorder.state.healthy
+    whole = Recording(path)
+    assert not whole.cut
+    numbers = [int(a.data) for a in whole.arrivals()]
+    lost = put - len(numbers)
+    assert lost == recorder._wire.dropped > 0
+    assert numbers[: len(before)] == before
+    assert numbers[-1] == put - 1
+    assert all(a < b for a, b in pairwise(numbers))
+    assert f"recording: {lost} reads of the port are missing before this" in [
+        text for _, text in whole.events()
+    ]
+    samples = np.concatenate(list(whole.increments()))["counter"]
+    assert len(samples) == put - recorder.state.dropped
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 128 kB, where one may be made."""
+    path = tmp_path / "disk"
+    path.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=128k", "tmpfs", str(path)]
+    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True).returncode:
+        pytest.skip("needs the right to mount a small tmpfs")
+    yield path
+    subprocess.run(["umount", str(path)], check=True)
+
+
+def test_a_really_full_disk_ends_when_somebody_makes_room(batch, wait_for, small_disk: Path) -> None:
+    filler = small_disk / "filler"
+    filler.write_bytes(bytes(60_000))
+    path = small_disk / "run.mcap"
+    recorder = open_recorder(path)
+    put = 0
+
+    def feed() -> None:
+        nonlocal put
+        recorder.arrived(Arrival(put, b"%044d" % put))
+        recorder.publish(batch(put, 1))
+        put += 1
+
+    wait_for(lambda: feed() or recorder.state.state == "disk full")
+    assert Recording(path).profile.name == "imu50-rs422"
+    part = [int(a.data) for a in Recording(path).arrivals()]
+    assert part == list(range(len(part)))
+    filler.unlink()
+    wait_for(lambda: recorder.state.queued == 0)
+    recorder.close()
+    assert recorder.state[1:] == ("ok", True, put, 0, 0)
+    assert [int(a.data) for a in Recording(path).arrivals()] == list(range(put))
+
+
+def test_a_disk_that_is_full_at_the_start_is_refused(tmp_path: Path, monkeypatch) -> None:
+    def full(descriptor: int, data: memoryview) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "write", full)
+    with pytest.raises(InputError, match=r"run\.mcap: cannot be written: disk full"):
+        open_recorder(tmp_path / "run.mcap")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_limit_of_file_size_is_a_full_disk(tmp_path: Path) -> None:
+    """The quota of another process, for it holds for the whole of one."""
+    path = tmp_path / "run.mcap"
+    program = f"""
+import resource, sys, time
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+from pathlib import Path
+from test_recorder import open_recorder
+from imudrv.ports.base import Arrival
+recorder = open_recorder(Path({str(path)!r}))
+n = 0
+while recorder.state.state != "disk full":
+    recorder.arrived(Arrival(n, b"%044d" % n))
+    n += 1
+    time.sleep(0.0005)
+recorder.close()
+print(recorder.state.state)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert (done.stdout, done.stderr) == ("disk full\n", "")
+    numbers = [int(a.data) for a in Recording(path).arrivals()]
+    assert numbers == list(range(len(numbers)))
+    assert numbers
+
+
+RECORDING = """
+import sys, time
+sys.path.insert(0, {here!r})
+from pathlib import Path
+from test_recorder import open_recorder
+from imudrv.ports.base import Arrival
+recorder = open_recorder(Path({path!r}))
+n = 0
+while True:
+    t_ns = time.monotonic_ns()
+    recorder.arrived(Arrival(t_ns, b"%044d" % n))
+    sys.stdout.write("%d %d\\n" % (n, t_ns))
+    sys.stdout.flush()
+    n += 1
+    time.sleep(0.0005)
+"""
+
+
+def test_a_kill_loses_nothing_that_was_read_a_quarter_of_a_second_before(tmp_path: Path) -> None:
+    rng = random.Random(3)
+    for round_ in range(4):
+        path = tmp_path / f"run{round_}.mcap"
+        log = tmp_path / f"log{round_}"
+        program = RECORDING.format(here=str(Path(__file__).parent), path=str(path))
+        with log.open("w") as output:
+            process = subprocess.Popen([sys.executable, "-c", program], stdout=output)
+            deadline = time.monotonic() + 20
+            while log.stat().st_size < 500 and time.monotonic() < deadline:
+                time.sleep(0.01)
+            time.sleep(rng.uniform(0.0, 0.4))
+            process.send_signal(signal.SIGKILL)
+            process.wait(20)
+        lines = [line.split() for line in log.read_text().splitlines()[:-1]]
+        assert len(lines) > 10
+        recording = Recording(path)
+        assert recording.cut
+        assert recording.profile.name == "imu50-rs422"
+        got = [int(a.data) for a in recording.arrivals()]
+        assert got == list(range(len(got)))
+        last_ns = int(lines[-1][1])
+        old = [int(n) for n, t_ns in lines if int(t_ns) < last_ns - 250_000_000]
+        assert len(got) >= len(old)
+
+
+def test_nothing_that_waits_is_without_bound(batch, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(recorder_module, "QUEUE_BYTES", 100 * (SIZE + 64))
+    monkeypatch.setattr("imudrv.sinks.spool.PERIOD_S", 3600)
+    recorder = open_recorder(tmp_path / "run.mcap")
+    for n in range(1000):
+        recorder.arrived(Arrival(n, b"x" * SIZE))
+        recorder.publish(batch(n, 1))
+    assert recorder.state[3:] == (0, 900, 100)
+    assert recorder.state.state == "ok; 900 reads of the port lost"
+    recorder.close()
+    recording = Recording(tmp_path / "run.mcap")
+    assert [a.t_ns for a in recording.arrivals()] == list(range(900, 1000))
+    assert np.concatenate(list(recording.increments()))["counter"].tolist() == list(range(900, 1000))
+    assert [text for _, text in recording.events()] == [
+        "recording: 900 reads of the port are missing before this"
+    ]

@@ -1,0 +1,423 @@
+"""The doctor: right and wrong profiles over real ports, and a system made of files for the rest."""
+
+import os
+import resource
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from queue import Queue
+from typing import Any
+
+import numpy as np
+import pytest
+
+from imudrv import diagnosis, doctor, profiles
+from imudrv.config import parse
+from imudrv.doctor import Step, System, Verdict, examine
+from imudrv.errors import InputError
+from imudrv.ports import Arrival, Port, PortLostError
+from imudrv.ports.url import split
+from imudrv.records import MESSAGE, Reason
+from imudrv.sim.capture import wire
+from imudrv.sim.live import play
+from imudrv.sim.scenario import Scenario
+from imudrv.wire.datagram import Source
+
+RS422, ACC, CAN, CANFD = (
+    profiles.load(name) for name in ("imu50-rs422", "imu50-rs422-acc", "imu50-can", "imu50-canfd")
+)
+LISTEN_S = 0.5
+
+
+def scenario(duration_s: float, **sections: Any) -> Scenario:
+    document = {
+        "format": "imu50-scenario",
+        "version": 1,
+        "site": {"latitude_deg": 28.2, "longitude_deg": 113.0, "height_m": 60.0},
+        "motion": [{"rest": {"duration_s": duration_s}}],
+        **sections,
+    }
+    return parse(document, Scenario, "test")
+
+
+def sent(profile: profiles.Profile, duration_s: float = 1.0, **sections: Any) -> Any:
+    pieces = [piece.data for piece in wire(scenario(duration_s, **sections), profile.layout())]
+    return b"".join(pieces) if profile.transport == "serial" else np.concatenate(pieces)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def playing() -> Iterator[Callable[[profiles.Profile, str], str]]:
+    """Plays a profile on a port in real time; where to listen."""
+    stop = threading.Event()
+    with ThreadPoolExecutor(1) as pool:
+
+        def start(profile: profiles.Profile, target: str = "pty", **sections: Any) -> str:
+            said: Queue[str] = Queue()
+            pool.submit(play, scenario(600.0, **sections), profile, target, 1.0, said.put, None, stop)
+            return said.get(timeout=20).split()[-1]
+
+        yield start
+        stop.set()
+
+
+@pytest.fixture
+def line() -> Iterator[tuple[int, str]]:
+    """A pty that somebody else speaks on: the speaker's end, and the listener's path."""
+    master, slave = os.openpty()
+    path = os.ttyname(slave)
+    os.close(slave)
+    yield master, path
+    os.close(master)
+
+
+def by_name(steps: Any) -> dict[str, Step]:
+    return {step.name: step for step in steps}
+
+
+@pytest.mark.parametrize("profile", [RS422, ACC])
+def test_a_unit_of_the_right_profile_is_healthy(profile: profiles.Profile, playing: Any) -> None:
+    steps = by_name(examine(playing(profile), profile.name, LISTEN_S))
+    assert all(step.verdict is not Verdict.FAIL for step in steps.values()), steps
+    assert list(steps)[:6] == ["device", "permission", "busy", "line load", "open", "data"]
+    assert "good frames" in steps["data"].found
+    assert "samples/s by the counter, 0 lost" in steps["data"].found
+    assert steps["status"].found == "no bit set"
+    assert "gyro 35.00 degC" in steps["temperatures"].found
+
+
+def test_the_command_tells_each_step_and_the_sum(playing: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "LISTEN_S", LISTEN_S)
+    said: list[str] = []
+    assert doctor.doctor(playing(RS422), "imu50-rs422", said.append)
+    assert said[0].startswith("  ok  device: /dev/pts/")
+    assert said[-1] == "healthy"
+    said.clear()
+    assert not doctor.doctor("/dev/no-such-port", "imu50-rs422", said.append)
+    assert said[0].startswith("fail  device: there is no /dev/no-such-port\n        -> ")
+    assert "must be mended" in said[-1]
+
+
+def test_a_wrong_profile_is_told_the_right_one(playing: Any) -> None:
+    steps = by_name(examine(playing(ACC), "imu50-rs422", LISTEN_S))
+    data = steps["data"]
+    assert data.verdict is Verdict.FAIL
+    assert "sync EB 90 seen" in data.found
+    assert data.found.endswith("this looks like imu50-rs422-acc at 460800")
+    assert data.fix == "use --profile imu50-rs422-acc"
+
+
+def test_without_a_profile_the_right_one_is_found(playing: Any) -> None:
+    steps = by_name(examine(playing(ACC), None, LISTEN_S))
+    assert steps["profile"].found == "this is imu50-rs422-acc: --profile imu50-rs422-acc"
+    assert steps["data"].verdict is Verdict.OK
+
+
+def test_a_line_that_spoils_frames_must_be_mended(playing: Any) -> None:
+    path = playing(RS422, faults={"stream": {"bit_flips": 0.2}})
+    data = by_name(examine(path, "imu50-rs422", LISTEN_S))["data"]
+    assert data.verdict is Verdict.FAIL
+    assert "x check failed" in data.found
+    assert "damaged" in data.found
+    assert "cable" in data.fix
+
+
+def test_silence_is_told(line: tuple[int, str]) -> None:
+    data = by_name(examine(line[1], "imu50-rs422", 0.1))["data"]
+    assert data.verdict is Verdict.FAIL
+    assert "silence: nothing in 0.1 s" in data.found
+    assert "powered" in data.fix
+
+
+def test_garbage_fits_nothing(line: tuple[int, str]) -> None:
+    noise = np.random.default_rng(1).bytes(2000)
+    stop = threading.Event()
+
+    def speak() -> None:
+        while not stop.wait(0.02):
+            os.write(line[0], noise)
+
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(speak)
+        data = by_name(examine(line[1], "imu50-rs422", 0.3))["data"]
+        stop.set()
+    assert data.verdict is Verdict.FAIL
+    assert "no shipped profile fits at any usual rate" in data.found
+
+
+def test_a_port_that_goes_away_meanwhile_is_told() -> None:
+    with ThreadPoolExecutor(1) as pool:
+        said: Queue[str] = Queue()
+        pool.submit(play, scenario(0.3), RS422, "pty", 1.0, said.put)
+        data = by_name(examine(said.get(timeout=20).split()[-1], "imu50-rs422", 20.0))["data"]
+    assert data.verdict is Verdict.FAIL
+    assert "plug, cable and adapter" in data.fix
+
+
+class FakeLine(Port):
+    """A serial line whose unit speaks one profile at one rate; at others noise arrives."""
+
+    def __init__(self, url: str, baudrate: int, right: int, profile: profiles.Profile) -> None:
+        super().__init__(url, Source.REPLAY)
+        noise = np.random.default_rng(baudrate).bytes(4000)
+        self._pieces = [sent(profile, 0.2) if baudrate == right else noise]
+
+    def read(self, timeout_s: float) -> Arrival:
+        if not self._pieces:
+            raise PortLostError("over")
+        return Arrival(1, self._pieces.pop())
+
+    def close(self) -> None:
+        self._pieces.clear()
+
+
+@pytest.mark.parametrize(
+    ("unit", "rate", "found", "fix"),
+    [
+        (ACC, 460_800, "imu50-rs422-acc at 460800", "use --profile imu50-rs422-acc"),
+        (RS422, 115_200, "imu50-rs422 at 115200", "use ?baudrate=115200 in the URL"),
+        (ACC, 2_000_000, "acc at 2000000", "use --profile imu50-rs422-acc and ?baudrate=2000000 in the URL"),
+    ],
+)
+def test_a_wrong_rate_is_found_by_trying(
+    monkeypatch: pytest.MonkeyPatch, unit: profiles.Profile, rate: int, found: str, fix: str
+) -> None:
+    opened = []
+
+    def open_fake(url: str, profile: profiles.Profile) -> Port:
+        baudrate = int(split(url).options.get("baudrate", profile.line.baudrate))  # type: ignore[union-attr]
+        opened.append(baudrate)
+        if baudrate == 115_201:
+            raise InputError("no such rate")
+        return FakeLine(url, baudrate, rate, unit)
+
+    monkeypatch.setattr(doctor, "open_port", open_fake)
+    monkeypatch.setattr(doctor, "BAUDRATES", (115_201, *doctor.BAUDRATES))
+    monkeypatch.setattr(doctor, "_listen", lambda port, _: (port.read(0.0).data, 0.2, ""))
+    monkeypatch.setattr(doctor, "_before", lambda *_: iter(()))
+    data = by_name(examine("/dev/ttyUSB9", "imu50-rs422", 0.1))["data"]
+    assert data.found.endswith(found)
+    assert data.fix == fix
+    assert opened[0] == 921_600
+    assert opened[-1] == rate
+    assert opened.count(921_600) == 1
+
+
+@pytest.fixture
+def system(tmp_path: Path) -> System:
+    """An empty one."""
+    for name in ("sys", "proc", "dev"):
+        (tmp_path / name).mkdir()
+    return System(tmp_path / "sys", tmp_path / "proc", tmp_path / "dev")
+
+
+def put(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text + "\n")
+
+
+def adapter(system: System, latency_ms: int, control: str) -> None:
+    """An FTDI adapter, as the kernel shows one."""
+    put(system.sys / "bus/usb-serial/devices/ttyUSB0/latency_timer", str(latency_ms))
+    usb_device = system.sys / "devices/usb1/1-2"
+    put(usb_device / "idVendor", "0403")
+    put(usb_device / "power/control", control)
+    (usb_device / "1-2:1.0/ttyUSB0").mkdir(parents=True)
+    tty = system.sys / "class/tty/ttyUSB0"
+    tty.mkdir(parents=True)
+    (tty / "device").symlink_to(usb_device / "1-2:1.0/ttyUSB0")
+
+
+def test_a_slow_latency_timer_and_a_sleepy_adapter_are_told_with_their_fix(system: System) -> None:
+    adapter(system, 16, "auto")
+    steps = by_name(doctor.usb("ttyUSB0", system))
+    timer, sleep = steps["latency timer"], steps["USB autosuspend"]
+    assert timer.verdict is sleep.verdict is Verdict.WARN
+    assert "16 ms" in timer.found
+    assert timer.fix.startswith("echo 1 | sudo tee ")
+    assert "devices/ttyUSB0/latency_timer" in timer.fix
+    assert "99-imu50.rules" in timer.fix
+    assert sleep.fix.startswith("echo on | sudo tee ")
+    assert "usb1/1-2/power/control" in sleep.fix
+
+
+def test_a_quick_adapter_is_well_and_a_port_that_is_none_says_nothing(system: System) -> None:
+    adapter(system, 1, "on")
+    assert {step.verdict for step in doctor.usb("ttyUSB0", system)} == {Verdict.OK}
+    assert list(doctor.usb("pts0", system)) == []
+
+
+@pytest.mark.parametrize(("flags", "verdict"), [("0x10002040", Verdict.OK), ("0x10000040", Verdict.WARN)])
+def test_a_built_in_port_tells_its_low_latency_flag(system: System, flags: str, verdict: Verdict) -> None:
+    put(system.sys / "class/tty/ttyS0/flags", flags)
+    (step,) = doctor.usb("ttyS0", system)
+    assert step.verdict is verdict
+
+
+def test_a_device_that_is_not_there_names_those_that_are(system: System) -> None:
+    by_id = system.dev / "serial/by-id"
+    by_id.mkdir(parents=True)
+    for name in ("ttyUSB0", "ttyUSB1"):
+        (system.dev / name).touch()
+    (by_id / "usb-FTDI_A1").symlink_to(system.dev / "ttyUSB0")
+    (step, *rest) = examine(str(system.dev / "ttyUSB5"), "imu50-rs422", 0.1, system)
+    assert step.verdict is Verdict.FAIL
+    assert step.fix == f"take one of {by_id / 'usb-FTDI_A1'}, {system.dev / 'ttyUSB1'}"
+    # and nothing is opened or listened to
+    assert [step.name for step in rest] == ["line load", "real-time priority", "locked memory"]
+
+
+def test_a_device_that_belongs_to_others_names_the_group(
+    line: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    steps = by_name(examine(line[1], "imu50-rs422", 0.1))
+    assert steps["permission"].verdict is Verdict.FAIL
+    assert f"sudo usermod -aG {Path(line[1]).group()} " in steps["permission"].fix
+    assert "99-imu50.rules" in steps["permission"].fix
+    assert "open" not in steps
+
+
+def test_another_program_on_the_port_is_named(line: tuple[int, str]) -> None:
+    program = (
+        f"import os, sys; os.open({line[1]!r}, os.O_RDWR | os.O_NOCTTY); print(flush=True); sys.stdin.read()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as other:
+        assert other.stdout is not None
+        other.stdout.readline()
+        step = by_name(examine(line[1], "imu50-rs422", 0.1))["busy"]
+        other.communicate(b"")
+    assert step.verdict is Verdict.FAIL
+    assert f"(process {other.pid})" in step.found
+
+
+@pytest.mark.parametrize(
+    ("flags", "verdict", "words"),
+    [(None, Verdict.FAIL, "no CAN interface can0, but vcan3"), ("0x40080", Verdict.FAIL, "down")],
+)
+def test_a_can_interface_that_is_not_ready_is_told(
+    system: System, flags: str | None, verdict: Verdict, words: str
+) -> None:
+    put(system.sys / "class/net/vcan3/flags", "0x1")
+    if flags:
+        put(system.sys / "class/net/can0/flags", flags)
+    (step, *_) = examine("can://socketcan/can0", "imu50-can", 0.1, system)
+    assert step.verdict is verdict
+    assert words in step.found
+    assert step.fix
+
+
+def test_a_can_interface_that_is_up_is_well(system: System) -> None:
+    put(system.sys / "class/net/can0/flags", "0x40081")
+    (step, *_) = examine("can://socketcan/can0", "imu50-can", 0.1, system)
+    assert step.verdict is Verdict.OK
+
+
+@pytest.mark.parametrize("profile", [CAN, CANFD])
+def test_a_unit_on_a_bus_is_healthy_and_its_identifiers_are_counted(
+    profile: profiles.Profile, playing: Any
+) -> None:
+    bus = "can://udp_multicast/239.74.163.11?port=43221"
+    playing(profile, bus)
+    steps = by_name(examine(bus, profile.name, LISTEN_S))
+    assert steps["data"].verdict is Verdict.OK, steps
+    assert ("150 " if profile is CAN else "158 ") in steps["data"].found
+
+
+def test_a_unit_with_another_can_profile_is_told_the_right_one(playing: Any) -> None:
+    bus = "can://virtual/doctor"
+    playing(CANFD, bus)
+    steps = by_name(examine(bus, "imu50-can", LISTEN_S))
+    assert steps["data"].verdict is Verdict.FAIL
+    assert steps["data"].found == "0 messages of imu50-can, never a whole sample: this looks like imu50-canfd"
+    assert steps["data"].fix == "use --profile imu50-canfd"
+
+
+def test_a_silent_bus_is_told() -> None:
+    data = by_name(examine("can://virtual/silent", "imu50-can", 0.1))["data"]
+    assert data.verdict is Verdict.FAIL
+    assert "silence" in data.found
+    assert "terminated" in data.fix
+
+
+def test_a_profile_reads_a_stretch_that_begins_and_ends_anywhere() -> None:
+    data = sent(RS422, 0.5)
+    heard = diagnosis.hear(RS422, data[17:-3])
+    assert heard.fits
+    assert heard.is_clean
+    assert heard.account.good == 498
+    assert heard.rejected == {}
+
+
+def test_the_best_profile_is_the_one_that_reads_most() -> None:
+    every = [profiles.load(name) for name in profiles.shipped()]
+    for profile in every:
+        found = diagnosis.best(every, sent(profile, 0.3))
+        assert found is not None
+        assert found.name == profile.name
+    assert diagnosis.best(every, b"") is None
+    assert diagnosis.best(every, np.zeros(0, MESSAGE)) is None
+
+
+def test_a_wrong_check_is_told_apart_from_a_wrong_frame() -> None:
+    frames = bytearray(sent(RS422, 0.1))
+    frames[43::44] = bytes(b ^ 1 for b in frames[43::44])
+    heard = diagnosis.hear(RS422, bytes(frames))
+    assert Reason.CHECK_FAILED in heard.rejected
+    step = doctor.mismatch(RS422, heard, None, True)
+    assert "sync EB 90 seen 100 times, CRC never right" in step.found
+
+
+def test_a_unit_that_reports_a_fault_or_another_rate_is_told() -> None:
+    heard = replace(diagnosis.hear(RS422, sent(RS422, 0.2)), set_bits=("power", "warm-up"))
+    steps = by_name(doctor.judge(RS422, heard, 0.5, True))
+    assert steps["status"].verdict is Verdict.WARN
+    assert steps["status"].found == "power, warm-up"
+    assert steps["rate"].verdict is Verdict.FAIL
+    assert "expected 1000 samples/s, the unit counts 400" in steps["rate"].found
+    assert "rate" not in by_name(doctor.judge(RS422, heard, 0.5, False))
+
+
+def test_the_line_load_is_that_of_the_interface_document() -> None:
+    # 44 bytes of 10 bits a millisecond (ICD, section 2)
+    assert diagnosis.line_load(RS422) == pytest.approx(0.477, abs=0.001)
+    # two messages of 135 bits at worst and two a tenth of a second: ISO 11898-1
+    assert diagnosis.line_load(CAN) == pytest.approx(2.02 * 135e-3, rel=1e-9)
+    assert 0.1 < diagnosis.line_load(CANFD) < 0.3
+    slow = RS422.model_copy(update={"line": profiles.SerialLine(baudrate=115_200)})
+    step = by_name(examine("/dev/no-such-port?baudrate=115200", "imu50-rs422", 0.1))["line load"]
+    assert diagnosis.line_load(slow) > 1.0
+    assert step.verdict is Verdict.FAIL
+    assert "of 115200 baud" in step.found
+
+
+def test_limits_that_are_too_low_are_told_with_their_fix(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    monkeypatch.setattr(resource, "getrlimit", lambda limit: (0, 0))
+    steps = by_name(doctor.limits())
+    assert {step.verdict for step in steps.values()} == {Verdict.WARN}
+    assert "rtprio 50' into /etc/security/limits.d" in steps["real-time priority"].fix
+    assert "LimitMEMLOCK=infinity" in steps["locked memory"].fix
+    unlimited = (resource.RLIM_INFINITY, resource.RLIM_INFINITY)
+    monkeypatch.setattr(resource, "getrlimit", lambda limit: unlimited)
+    assert {step.verdict for step in doctor.limits()} == {Verdict.OK}
+
+
+def test_a_url_or_profile_without_sense_is_refused() -> None:
+    with pytest.raises(InputError, match="expected one of imu50-can"):
+        list(examine("/dev/ttyUSB0", "imu51", 0.1))
+    with pytest.raises(InputError):
+        list(examine("nonsense", None, 0.1))
+    with pytest.raises(InputError, match="expected a port for the can profile"):
+        list(examine("loop://", "imu50-can", 0.1))
+
+
+def test_a_simulated_unit_can_be_examined_too() -> None:
+    steps = by_name(examine("sim://z-up?speed=max", None, 0.2))
+    assert steps["profile"].found.startswith("this is imu50-rs422:")
+    assert steps["data"].verdict is Verdict.OK

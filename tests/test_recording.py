@@ -1,0 +1,282 @@
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zstandard
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+
+from imudrv import profiles
+from imudrv.errors import FaultyFileError, InputError
+from imudrv.ports.base import Arrival
+from imudrv.recording import Recording, pack, pack_messages, unpack_messages
+from imudrv.records import INCREMENTS, MESSAGE, PULSES
+from imudrv.sinks.base import Batch
+from imudrv.sinks.recorder import Recorder
+from imudrv.wire.datagram import Source, encode
+
+PROFILES = Path(profiles.__file__).parent
+CALIBRATION = b"""\
+format: imu50-calibration
+version: 1
+serial_number: "50-0017"
+created: 2026-11-22T10:00:00Z
+gyro:
+  scale_arcsec_per_pulse: [0.5, 0.5, 0.5]
+  bias_deg_per_h: [0.0, 0.0, 0.0]
+  C_bg: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+accelerometer:
+  scale_pulse_per_m_s: [2000.0, 2000.0, 2000.0]
+  bias_ug: [0.0, 0.0, 0.0]
+  C_ba: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+"""
+
+
+def record(path: Path, samples: int) -> None:
+    profile = "imu50-rs422"
+    recorder = Recorder(
+        path,
+        layout=profiles.load(profile).layout(),
+        profile=(PROFILES / f"{profile}.yaml").read_bytes(),
+        calibration=CALIBRATION,
+        source=Source.SIMULATOR,
+        port="sim://x.yaml",
+        unit="50-0017",
+    )
+    for n in range(samples):
+        increments = np.zeros(1, INCREMENTS)
+        increments["counter"], increments["interval_ns"] = n, 1_000_000
+        increments["flags"] = 1
+        recorder.arrived(Arrival(1000 + n, b"%044d" % n))
+        recorder.publish(Batch(np.zeros(1, PULSES), increments, encode(increments, Source.SIMULATOR)))
+    recorder.status({"rate_hz": 1000.0})
+    recorder.event(5000, "unplugged")
+    recorder.calibration(6000, CALIBRATION.replace(b"0.5, 0.5, 0.5", b"0.6, 0.6, 0.6"))
+    recorder.close()
+
+
+@pytest.fixture(scope="session")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("recording") / "run.mcap"
+    record(path, 30)
+    return path
+
+
+def places_of(data: bytes, opcode: int) -> list[int]:
+    """Where the records of a kind begin."""
+    places = []
+    at = 8
+    while at < len(data) - 8:
+        if data[at] == opcode:
+            places.append(at)
+        at += 9 + struct.unpack_from("<Q", data, at + 1)[0]
+    return places
+
+
+def contents(recording: Recording) -> tuple[list[object], ...]:
+    return (
+        list(recording.arrivals()),
+        [row.tobytes() for piece in recording.increments() for row in piece],
+        list(recording.statuses()),
+        list(recording.events()),
+        list(recording.calibrations()),
+    )
+
+
+def test_everything_that_was_recorded_comes_back(recorded: Path) -> None:
+    recording = Recording(recorded)
+    assert not recording.cut
+    assert recording.profile == profiles.load("imu50-rs422")
+    assert recording.calibration is not None
+    assert recording.calibration.serial_number == "50-0017"
+    assert recording.calibration_text == CALIBRATION.decode()
+    assert recording.origin["port"] == "sim://x.yaml"
+    assert recording.origin["version"] == "0.1.0"
+    arrivals, increments, statuses, events, calibrations = contents(recording)
+    assert arrivals == [Arrival(1000 + n, b"%044d" % n) for n in range(30)]
+    assert len(increments) == 30
+    assert [status for _, status in statuses] == [{"rate_hz": 1000.0}]
+    assert events == [(5000, "unplugged")]
+    assert [c.gyro.scale_arcsec_per_pulse[0] for _, c in calibrations] == [0.5, 0.6]
+    assert calibrations[1][0] == 6000
+
+
+def test_a_recording_cut_at_any_byte_opens_up_to_the_cut(recorded: Path, tmp_path: Path) -> None:
+    whole = recorded.read_bytes()
+    arrivals = list(Recording(recorded).arrivals())
+    ends = [at + 9 + 22 + 44 for at in places_of(whole, 5)[: len(arrivals)]]
+    path = tmp_path / "cut.mcap"
+    for size in range(len(whole)):
+        path.write_bytes(whole[:size])
+        recording = Recording(path)
+        assert recording.cut
+        assert list(recording.arrivals()) == arrivals[: sum(end <= size for end in ends)]
+
+
+def test_a_recording_that_was_cut_before_its_profile_says_so(recorded: Path, tmp_path: Path) -> None:
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(recorded.read_bytes()[:100])
+    with pytest.raises(InputError, match=r"cut\.mcap.*cut before it, there is nothing in it"):
+        _ = Recording(path).profile
+    assert Recording(path).origin == {}
+    assert Recording(path).calibration is None
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_chunks_of_any_compression_are_read(
+    recorded: Path, tmp_path: Path, compression: CompressionType
+) -> None:
+    path = tmp_path / "chunked.mcap"
+    with recorded.open("rb") as source, path.open("wb") as target:
+        reader = make_reader(source)
+        writer = Writer(target, compression=compression, chunk_size=500)
+        writer.start()
+        for attachment in reader.iter_attachments():
+            writer.add_attachment(**vars(attachment))
+        ids = {}
+        for _, channel, message in reader.iter_messages(log_time_order=False):
+            if channel.id not in ids:
+                ids[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, 0)
+            writer.add_message(ids[channel.id], message.log_time, message.data, message.log_time)
+        writer.finish()
+    assert contents(Recording(path)) == contents(Recording(recorded))
+    whole = path.read_bytes()
+    chunks = places_of(whole, 6)
+    path.write_bytes(whole[: chunks[len(chunks) // 2] + 50])
+    part = list(Recording(path).arrivals())
+    assert 0 < len(part) < 30
+    assert part == list(Recording(recorded).arrivals())[: len(part)]
+
+
+def test_packing_makes_it_smaller_and_changes_nothing(recorded: Path, tmp_path: Path) -> None:
+    path = tmp_path / "packed.mcap"
+    assert pack(recorded, path) == (33, False)
+    assert path.stat().st_size < recorded.stat().st_size
+    assert not Recording(path).cut
+    assert contents(Recording(path)) == contents(Recording(recorded))
+    with recorded.open("rb") as one, path.open("rb") as two:
+        before, after = make_reader(one), make_reader(two, validate_crcs=True)
+        summary = after.get_summary()
+        assert summary is not None
+        assert summary.chunk_indexes
+        assert {chunk.compression for chunk in summary.chunk_indexes} == {"zstd"}
+        assert summary.statistics is not None
+        assert summary.statistics.message_count == 33
+        messages = [[(c.topic, vars(m)) for _, c, m in r.iter_messages()] for r in (before, after)]
+        assert messages[0] == messages[1]
+        assert list(before.iter_attachments()) == list(after.iter_attachments())
+        assert list(before.iter_metadata()) == list(after.iter_metadata())
+
+
+def test_a_cut_recording_is_packed_up_to_its_cut_and_in_place(recorded: Path, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_bytes(recorded.read_bytes()[:-900])
+    before = contents(Recording(path))
+    assert pack(path, path).cut
+    assert not Recording(path).cut
+    assert contents(Recording(path)) == before
+    assert [p.name for p in tmp_path.iterdir()] == ["run.mcap"]
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "other"
+    with pytest.raises(InputError, match="expected a recording, cannot read it: No such file"):
+        Recording(path)
+    path.write_bytes(b"\xeb\x90\x50\x26" * 100)
+    with pytest.raises(InputError, match=r"expected a recording \(MCAP\), got another kind of file"):
+        Recording(path)
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.finish()
+    with pytest.raises(
+        InputError, match=r"expected a recording with its profile\.yaml, got none: it is not one"
+    ):
+        _ = Recording(path).profile
+
+
+@pytest.mark.parametrize("opcode", [1, 3, 4, 5, 9, 12])
+def test_a_record_of_absurd_length_is_not_read_but_told_with_its_place(
+    recorded: Path, tmp_path: Path, opcode: int
+) -> None:
+    data = bytearray(recorded.read_bytes())
+    at = places_of(data, opcode)[0]
+    struct.pack_into("<Q", data, at + 1, 1 << 40)
+    path = tmp_path / "bad.mcap"
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=rf"bad\.mcap: at byte {at}: expected a record.*damaged"):
+        list(Recording(path).arrivals())
+
+
+def test_a_chunk_that_unpacks_to_more_than_it_says_is_refused(recorded: Path, tmp_path: Path) -> None:
+    bomb = zlib.compress(b"")  # any bytes; the claims are what matters
+    path = tmp_path / "bad.mcap"
+
+    def chunk(compression: bytes, size: int, data: bytes) -> bytes:
+        body = struct.pack("<QQQII", 0, 0, size, 0, len(compression)) + compression
+        body += struct.pack("<Q", len(data)) + data
+        return struct.pack("<BQ", 6, len(body)) + body
+
+    zeros = zstandard.compress(bytes(1 << 26))
+    for record_, told in (
+        (chunk(b"zstd", 1000, zeros), "length and check are right"),
+        (chunk(b"zstd", 1 << 40, zeros), "at most"),
+        (chunk(b"zstd", 1000, bomb), "unpacks"),
+        (chunk(b"lz4", 1000, bomb), "unpacks"),
+        (chunk(b"rar", 1000, bomb), "unknown compression 'rar'"),
+        (chunk(b"", 1 << 10, chunk(b"", 0, b"")), "length and check are right"),
+        (chunk(b"", len(chunk(b"", 0, b"")), chunk(b"", 0, b"")), "no chunk inside of a chunk"),
+    ):
+        path.write_bytes(recorded.read_bytes()[:8] + record_)
+        with pytest.raises(InputError, match=rf"at byte 8: .*{told}"):
+            list(Recording(path).arrivals())
+
+
+def test_an_attachment_that_was_changed_is_told(recorded: Path, tmp_path: Path) -> None:
+    data = bytearray(recorded.read_bytes())
+    at = places_of(data, 9)[0]
+    data[at + 200] ^= 1
+    path = tmp_path / "bad.mcap"
+    path.write_bytes(data)
+    with pytest.raises(
+        InputError, match=rf"at byte {at}: expected a whole attachment record: its check is wrong"
+    ):
+        _ = Recording(path).profile
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_whatever_is_damaged_it_is_read_or_told(recorded: Path, tmp_path: Path, data: st.DataObject) -> None:
+    content = bytearray(recorded.read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        content[data.draw(st.integers(8, len(content) - 1))] = data.draw(st.integers(0, 255))
+    path = tmp_path / "bad.mcap"
+    path.write_bytes(content)
+    recording = Recording(path)
+    for read in (
+        lambda: contents(recording),
+        lambda: recording.profile,
+        lambda: recording.origin,
+        lambda: pack(path, tmp_path / "packed.mcap"),
+    ):
+        try:
+            read()
+        except InputError as error:
+            assert "bad.mcap" in str(error) or isinstance(error, FaultyFileError)  # noqa: PT017
+
+
+@given(st.lists(st.lists(st.tuples(st.integers(0, 64), st.integers(0, 2**29 - 1)), max_size=5), min_size=1))
+def test_can_messages_pack_and_unpack(pieces: list[list[tuple[int, int]]]) -> None:
+    arrays = []
+    for piece in pieces:
+        messages = np.zeros(len(piece), MESSAGE)
+        for row, (length, identifier) in zip(messages, piece, strict=True):
+            row["t_ns"], row["id"], row["length"], row["fd"] = -identifier, identifier, length, length > 8
+            row["data"][:length] = np.arange(length) + identifier % 100
+        arrays.append(messages)
+    for messages, packed in zip(arrays, pack_messages(arrays), strict=True):
+        assert np.array_equal(unpack_messages(packed), messages)

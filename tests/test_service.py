@@ -1,0 +1,385 @@
+"""The live service as users run it: real processes on real ptys, sockets and buses."""
+
+import json
+import os
+import pty
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+import tty
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from imudrv.profiles import load
+from imudrv.receive import receive
+from imudrv.recording import Recording
+from imudrv.records import PULSES, Flag
+from imudrv.status import ask
+from imudrv.wire.encode import StreamEncoder
+
+LAYOUT = load("imu50-rs422").layout()
+DEADLINE_S = 60.0
+CALIBRATION = """
+format: imu50-calibration
+version: 1
+serial_number: "50-0017"
+created: 2026-11-22T10:00:00Z
+gyro:
+  scale_arcsec_per_pulse: [0.5, 0.5, 0.5]
+  bias_deg_per_h: [0.0, 0.0, 0.0]
+  C_bg: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+accelerometer:
+  scale_pulse_per_m_s: [2000.0, 2000.0, 2000.0]
+  bias_ug: [0.0, 0.0, 0.0]
+  C_ba: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+size_effect:
+  r_mm: {x: [24, -11, -9], y: [-23, 29, -7], z: [-1, -18, 16]}
+  gauge: centroid
+"""
+
+
+def frames(first: int, count: int) -> bytes:
+    """Frames of a unit that turns a little."""
+    pulses = np.zeros(count, PULSES)
+    pulses["counter"] = first + np.arange(count)
+    pulses["gyro"] = np.rint(100.0 * np.sin(pulses["counter"] / 50.0))[:, None]
+    pulses["accelerometer"] = [0, 0, 20]
+    pulses["temperature_degc"] = 35.0
+    return StreamEncoder(LAYOUT).encode(pulses).tobytes()
+
+
+def until(true: Callable[[], object], what: str) -> None:
+    """Wait for something that must come; the deadline only ends a broken test."""
+    end = time.monotonic() + DEADLINE_S
+    while not true():
+        assert time.monotonic() < end, f"waited in vain: {what}"
+        time.sleep(0.02)
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
+
+
+class Unit:
+    """A unit on a pty that keeps its name when it is pulled out and put in again."""
+
+    def __init__(self, link: Path) -> None:
+        self.link = link
+        self.counter = 0
+        self.plug()
+
+    def plug(self) -> None:
+        self._master, slave = pty.openpty()
+        tty.setraw(slave)
+        os.set_blocking(self._master, False)
+        self.link.unlink(missing_ok=True)
+        self.link.symlink_to(os.ttyname(slave))
+        self._slave = slave
+
+    def unplug(self) -> None:
+        os.close(self._slave)
+        os.close(self._master)
+        self.link.unlink()
+
+    def send(self, count: int) -> None:
+        for _ in range(0, count, 20):
+            n = min(20, count)
+            data = frames(self.counter, n)
+            self.counter += n
+            while data:
+                try:
+                    data = data[os.write(self._master, data) :]
+                except BlockingIOError:
+                    time.sleep(0.001)
+
+    def skip(self, count: int) -> None:
+        """Numbers that the unit counts while nobody hears."""
+        self.counter += count
+
+
+class Service:
+    """A running `imudrv run`."""
+
+    def __init__(self, folder: Path, *arguments: object) -> None:
+        self.socket = folder / "status.sock"
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "imudrv", "run", *map(str, arguments), "--status", str(self.socket)],
+            cwd=folder,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        self.said: list[str] = []
+        assert self.process.stdout is not None
+        self._listener = threading.Thread(target=lambda: self.said.extend(self.process.stdout or []))
+        first = self.process.stdout.readline()
+        self.said.append(first)
+        self._listener.start()
+        assert "serving" in first, first + self.process.stderr.read() if self.process.stderr else first
+
+    def status(self) -> dict[str, Any]:
+        return ask(self.socket)
+
+    def good(self) -> int:
+        return int(self.status()["account"]["good"])
+
+    def heard(self, words: str) -> bool:
+        return any(words in line for line in self.said)
+
+    def stop(self, number: int = signal.SIGTERM) -> int:
+        self.process.send_signal(number)
+        return self.ended()
+
+    def ended(self) -> int:
+        code = self.process.wait(DEADLINE_S)
+        self._listener.join()
+        return code
+
+
+@contextmanager
+def serving(folder: Path, *arguments: object) -> Iterator[Service]:
+    service = Service(folder, *arguments)
+    try:
+        yield service
+    finally:
+        if service.process.poll() is None:
+            service.process.kill()
+            service.ended()
+        for stream in (service.process.stdout, service.process.stderr):
+            if stream is not None:
+                stream.close()
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "unit.yaml").write_text(CALIBRATION)
+    return tmp_path
+
+
+def serial(folder: Path) -> list[object]:
+    return ["--port", folder / "unit", "--profile", "imu50-rs422", "--calibration", "unit.yaml"]
+
+
+def test_every_sample_comes_out_in_order_and_as_the_offline_command_makes_it(folder: Path) -> None:
+    unit = Unit(folder / "unit")
+    out = f"udp://127.0.0.1:{free_port()}"
+    with (
+        receive(out, timeout_s=DEADLINE_S) as receiver,
+        serving(folder, *serial(folder), "--out", out, "--record", "run.mcap") as service,
+    ):
+        got = []
+        for _ in range(10):
+            unit.send(200)
+            received = 0
+            while received < 200:
+                got.append(next(receiver))
+                received += len(got[-1])
+        assert service.stop() == 0
+    live = np.concatenate(got)
+    assert live["counter"].tolist() == list(range(2000))
+    assert receiver.lost == 0
+
+    command = [sys.executable, "-m", "imudrv", "compensate", "run.mcap", "-o", "offline.npz"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert "2000 samples by the counter = 2000 good; 0 duplicate" in done.stdout
+    with np.load(folder / "offline.npz") as offline:
+        for name, column in (("dtheta", "dtheta_b"), ("dv", "dv_b"), ("t_ns", "t_ns"), ("flags", "flags")):
+            np.testing.assert_array_equal(offline[name], live[column], err_msg=name)
+    recorded = np.concatenate(list(Recording(folder / "run.mcap").increments()))
+    for name in live.dtype.names or ():
+        np.testing.assert_array_equal(recorded[name], live[name], err_msg=name)
+
+
+def test_an_unplug_is_told_and_after_the_replug_the_stream_goes_on_with_the_gap_flagged(folder: Path) -> None:
+    unit = Unit(folder / "unit")
+    with serving(folder, *serial(folder), "--record", "run.mcap") as service:
+        unit.send(300)
+        until(lambda: service.good() == 300, "the first 300 samples")
+        unit.unplug()
+        until(lambda: service.heard("port lost"), "the loss told")
+        until(lambda: service.status()["health"] == "fail", "the loss in the status")
+        unit.skip(50)
+        unit.plug()
+        until(lambda: service.heard("port is back"), "the port again")
+        unit.send(300)
+        until(lambda: service.good() == 600, "the other 300 samples")
+        status = service.status()
+        assert status["account"]["missing"] == 50
+        assert status["account"]["closes"]
+        until(lambda: service.status()["port"]["reconnects"] == 1, "the reconnect counted")
+        assert service.stop() == 0
+    increments = np.concatenate(list(Recording(folder / "run.mcap").increments()))
+    flagged = increments["flags"] & Flag.MISSING_BEFORE != 0
+    assert increments["counter"][flagged].tolist() == [350]
+
+
+def test_silence_is_told_and_nothing_exits(folder: Path) -> None:
+    unit = Unit(folder / "unit")
+    with serving(folder, *serial(folder)) as service:
+        until(lambda: service.heard("silent"), "silence told")
+        unit.send(100)
+        until(lambda: service.heard("the unit is back"), "the unit heard again")
+        until(lambda: service.good() == 100, "its samples")
+        assert service.stop(signal.SIGINT) == 0
+        assert service.heard("100 good")
+    assert not service.socket.exists()
+
+
+def test_a_calibration_is_exchanged_while_running_and_a_bad_one_is_refused(folder: Path) -> None:
+    unit = Unit(folder / "unit")
+    with serving(folder, *serial(folder), "--record", "run.mcap") as service:
+        unit.send(200)
+        before = service.status()["calibration"]["sha256"]
+        (folder / "unit.yaml").write_text(CALIBRATION.replace("[0.5, 0.5, 0.5]", "[0.5, 0.5, half]"))
+        until(lambda: service.status()["calibration"]["refused"], "the bad file refused")
+        assert "scale_arcsec_per_pulse[2]" in service.status()["calibration"]["refused"]
+        assert service.status()["calibration"]["sha256"] == before
+
+        (folder / "unit.yaml").write_text(CALIBRATION.replace("[0.5, 0.5, 0.5]", "[1.0, 1.0, 1.0]"))
+        service.process.send_signal(signal.SIGHUP)
+        until(lambda: service.status()["calibration"]["exchanges"] == 1, "the good one taken")
+        status = service.status()["calibration"]
+        assert status["sha256"] != before
+        assert status["refused"] == ""
+        unit.send(200)
+        until(lambda: service.good() == 400, "all samples")
+        assert service.stop() == 0
+    increments = np.concatenate(list(Recording(folder / "run.mcap").increments()))
+    assert increments["counter"].tolist() == list(range(400))
+    # The pulses have a period of 314 samples, so sums over the two halves tell the scales apart.
+    again = [c for _, c in Recording(folder / "run.mcap").calibrations()]
+    assert [c.gyro.scale_arcsec_per_pulse[0] for c in again] == [0.5, 1.0]
+    pulses = np.rint(100.0 * np.sin(np.arange(400) / 50.0))
+    scale = increments["dtheta_b"][:, 0][np.abs(pulses) > 0] / pulses[np.abs(pulses) > 0]
+    assert np.unique(np.round(scale / scale[0], 9)).tolist() == [1.0, 2.0]
+
+
+def test_a_calibration_of_another_unit_is_refused_at_the_start(folder: Path) -> None:
+    command = [sys.executable, "-m", "imudrv", "run", *map(str, serial(folder)), "--unit", "50-0018"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 2
+    assert "50-0017" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_tcp_client_that_stops_reading_loses_its_own_samples_only(folder: Path) -> None:
+    unit = Unit(folder / "unit")
+    port = free_port()
+    with (
+        serving(folder, *serial(folder), "--out", f"tcp://127.0.0.1:{port}") as service,
+        socket.socket() as stuck,
+    ):
+        stuck.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        stuck.connect(("127.0.0.1", port))
+        with receive(f"tcp://127.0.0.1:{port}", timeout_s=DEADLINE_S) as reader:
+            until(lambda: "2 clients" in service.status()["sinks"][0]["state"], "two clients")
+            total, sent = 0, 0
+            while service.status()["sinks"][0]["dropped"] == 0:
+                unit.send(1000)
+                sent += 1000
+                while total < sent:
+                    total += len(next(reader))
+                assert sent < 400_000, "the stuck client's queue has no bound"
+            assert reader.lost == 0
+            until(lambda: service.good() == sent, "all of them counted")
+        assert service.stop() == 0
+
+
+def test_a_receiver_that_is_not_there_costs_nothing(folder: Path) -> None:
+    unit = Unit(folder / "unit")
+    with serving(folder, *serial(folder), "--out", f"udp://127.0.0.1:{free_port()}") as service:
+        unit.send(500)
+        until(lambda: service.good() == 500, "all samples")
+        until(lambda: service.status()["sinks"][0]["state"] == "nobody listens", "the state")
+        assert service.status()["health"] in ("warn", "fail")
+        assert service.stop() == 0
+
+
+def test_a_status_for_scripts_and_one_for_people(folder: Path) -> None:
+    unit = Unit(folder / "unit")
+    with serving(folder, *serial(folder)) as service:
+        unit.send(100)
+        until(lambda: service.good() == 100, "the samples")
+        until(lambda: service.status()["port"]["state"] == "silent", "silence")
+
+        def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+            command = [sys.executable, "-m", "imudrv", *arguments, "--status", str(service.socket)]
+            return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300)
+
+        as_json = run("status", "--json")
+        assert as_json.returncode == 4
+        assert json.loads(as_json.stdout)["account"]["good"] == 100
+        assert run("status").stdout.startswith("fail\nport silent")
+        assert "100 good" in run("monitor").stdout
+        second = subprocess.run(
+            [
+                sys.executable,
+                "-m",
+                "imudrv",
+                "run",
+                *map(str, serial(folder)),
+                "--status",
+                str(service.socket),
+            ],
+            cwd=folder,
+            capture_output=True,
+            text=True,
+            timeout=300,
+        )
+        assert second.returncode == 2
+        assert "expected no other service" in second.stderr
+        assert service.stop() == 0
+    gone = subprocess.run(
+        [sys.executable, "-m", "imudrv", "status", "--status", str(service.socket)],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert gone.returncode == 2
+    assert "expected a running service" in gone.stderr
+
+
+def test_the_service_manager_is_told(folder: Path) -> None:
+    unit = Unit(folder / "unit")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(folder / "notify"))
+        manager.settimeout(DEADLINE_S)
+        os.environ["NOTIFY_SOCKET"], os.environ["WATCHDOG_USEC"] = str(folder / "notify"), "300000"
+        try:
+            with serving(folder, *serial(folder)) as service:
+                assert manager.recv(100) == b"READY=1"
+                assert manager.recv(100) == b"WATCHDOG=1"
+                unit.send(20)
+                assert service.stop() == 0
+            rest = set()
+            while (message := manager.recv(100)) != b"STOPPING=1":
+                rest.add(message)
+            assert rest <= {b"WATCHDOG=1"}
+        finally:
+            del os.environ["NOTIFY_SOCKET"], os.environ["WATCHDOG_USEC"]
+
+
+def test_a_replay_of_a_capture_gives_what_the_offline_command_gives(folder: Path) -> None:
+    (folder / "run.raw").write_bytes(frames(0, 3000)[:-10])
+    arguments = ["--port", "replay://run.raw?speed=max", *serial(folder)[2:], "--out", "file:live.i50n"]
+    with serving(folder, *arguments) as service:
+        assert service.ended() == 0
+        assert service.heard("2999 samples by the counter = 2999 good")
+    command = [sys.executable, "-m", "imudrv", "compensate", "run.raw", *map(str, serial(folder)[2:])]
+    subprocess.run([*command, "-o", "offline.i50n"], cwd=folder, check=True, timeout=300, capture_output=True)
+    live, offline = (np.fromfile(folder / f"{n}.i50n", "u1").reshape(-1, 76) for n in ("live", "offline"))
+    # All but source, flags and time, which a replay has and a capture has not, and the check over them.
+    for part in (slice(8, 16), slice(24, 72)):
+        np.testing.assert_array_equal(live[:, part], offline[:, part])

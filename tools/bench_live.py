@@ -1,0 +1,161 @@
+"""How late samples come through the live service, beside a loop that only forwards bytes.
+
+A player writes frames into a pty at 1 kHz, a receiver takes what comes out by UDP; both read the same clock.
+Between them runs either the service, or `select`, `os.read` and `sendto` with nothing in between: what the
+system itself takes. The two take turns, so that the machine's moods hit both.
+"""
+
+import os
+import pty
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import tty
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imudrv.process import quiet_memory
+from imudrv.profiles import load
+from imudrv.records import PULSES
+from imudrv.wire.datagram import SIZE
+from imudrv.wire.encode import StreamEncoder
+
+LAYOUT: Final = load("imu50-rs422").layout()
+FRAME: Final = LAYOUT.messages[0].length
+TAU_S: Final = 1e-3
+SETTLE: Final = 500
+"""Samples at the beginning that do not count: caches, branch predictors and the scheduler find their way."""
+CALIBRATION: Final = """
+format: imu50-calibration
+version: 1
+serial_number: "bench"
+created: 2026-11-22T10:00:00Z
+gyro:
+  scale_arcsec_per_pulse: [0.5, 0.5, 0.5]
+  bias_deg_per_h: [0.0, 0.0, 0.0]
+  C_bg: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+accelerometer:
+  scale_pulse_per_m_s: [2000.0, 2000.0, 2000.0]
+  bias_ug: [0.0, 0.0, 0.0]
+  C_ba: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+size_effect:
+  r_mm: {x: [24, -11, -9], y: [-23, 29, -7], z: [-1, -18, 16]}
+  gauge: centroid
+"""
+BARE: Final = """
+import gc, os, select, socket, sys
+path, port = sys.argv[1], int(sys.argv[2])
+fd = os.open(path, os.O_RDWR | os.O_NOCTTY)
+out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+out.connect(("127.0.0.1", port))
+gc.collect(); gc.freeze(); gc.disable()
+print("ready", flush=True)
+while True:
+    select.select([fd], [], [])
+    data = os.read(fd, 65536)
+    for at in range(0, len(data), 1408):
+        out.send(data[at:at + 1408])
+"""
+
+
+def play(master: int, sent_ns: NDArray[np.int64]) -> None:
+    """Write one frame each millisecond; note when."""
+    pulses = np.zeros(len(sent_ns), PULSES)
+    pulses["counter"] = np.arange(len(sent_ns))
+    pulses["temperature_degc"] = 35.0
+    frames = [row.tobytes() for row in StreamEncoder(LAYOUT).encode(pulses)]
+    begin = time.monotonic() + 0.1
+    for k, frame in enumerate(frames):
+        time.sleep(max(0.0, begin + k * TAU_S - time.monotonic()))
+        sent_ns[k] = time.monotonic_ns()
+        os.write(master, frame)
+
+
+def receive(inlet: socket.socket, counter_at: int, size: int, came_ns: NDArray[np.int64]) -> None:
+    """Note when each sample comes, until a second of silence."""
+    inlet.settimeout(2.0)
+    buffer = bytearray(65536)
+    while True:
+        try:
+            length = inlet.recv_into(buffer)
+        except TimeoutError:
+            return
+        now = time.monotonic_ns()
+        for at in range(0, length, size):
+            counter = int.from_bytes(buffer[at + counter_at : at + counter_at + 4], "little")
+            if counter < len(came_ns):
+                came_ns[counter] = now
+
+
+def one_round(samples: int, service: bool, folder: Path) -> NDArray[np.float64]:
+    """Play samples through one of the two; seconds that each took."""
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    path = os.ttyname(slave)
+    inlet = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    inlet.bind(("127.0.0.1", 0))
+    port = inlet.getsockname()[1]
+    if service:
+        (folder / "unit.yaml").write_text(CALIBRATION)
+        command = [sys.executable, "-m", "imudrv", "run", "--port", path, "--profile", LAYOUT.name]
+        command += ["--calibration", str(folder / "unit.yaml"), "--out", f"udp://127.0.0.1:{port}"]
+        command += ["--status", str(folder / "status.sock")]
+    else:
+        command = [sys.executable, "-c", BARE, path, str(port)]
+    middle = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+    assert middle.stdout is not None
+    middle.stdout.readline()
+    came_ns = np.zeros(samples, np.int64)
+    listener = os.fork()
+    if listener == 0:
+        with quiet_memory():
+            receive(inlet, *((8, SIZE) if service else (4, FRAME)), came_ns)
+        np.save(folder / "came.npy", came_ns)
+        os._exit(0)
+    sent_ns = np.zeros(samples, np.int64)
+    with quiet_memory():
+        play(master, sent_ns)
+    os.waitpid(listener, 0)
+    middle.send_signal(signal.SIGTERM)
+    middle.wait()
+    inlet.close()
+    os.close(master)
+    os.close(slave)
+    came_ns = np.load(folder / "came.npy")
+    lost = int(np.count_nonzero(came_ns == 0))
+    if lost:
+        raise SystemExit(f"{'service' if service else 'bare loop'}: {lost} of {samples} samples did not come")
+    return (came_ns - sent_ns)[SETTLE:] * 1e-9
+
+
+def live(seconds: int, rounds: int) -> dict[str, dict[str, float]]:
+    """Measure both in turns.
+
+    Parameters
+    ----------
+    seconds, rounds : int
+        Length of a round, and how many of each.
+
+    Returns
+    -------
+    dict
+        Seconds of each quantile, and the ratios.
+    """
+    taken: dict[str, list[NDArray[np.float64]]] = {"bare loop": [], "service": []}
+    with tempfile.TemporaryDirectory() as name:
+        for _ in range(rounds):
+            for which, all_rounds in taken.items():
+                all_rounds.append(one_round(seconds * 1000, which == "service", Path(name)))
+    quantiles = {"p50": 0.5, "p99": 0.99, "p99.9": 0.999, "max": 1.0}
+    result = {
+        which: {name: float(np.quantile(np.concatenate(all_rounds), q)) for name, q in quantiles.items()}
+        for which, all_rounds in taken.items()
+    }
+    result["ratio"] = {name: result["service"][name] / result["bare loop"][name] for name in quantiles}
+    return result
