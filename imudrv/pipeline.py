@@ -49,7 +49,8 @@ class Pipeline:
         self.clock = ClockModel(self._layout.interval_ns, profile.transmission_ns)
         self._compensator = Compensator(coefficients, self._layout, rate_filter)
         self._next: Compensator | None = None
-        self._last_ns = 0  # time by the counter of the newest increment handed on
+        self._repeats = False
+        self._last_ns = 0  # time by the counter of the newest increment handed on, while it matters
 
     def feed(self, data: bytes | memoryview | Records, t_ns: int) -> Sampled:
         """Take in what arrived.
@@ -71,8 +72,9 @@ class Pipeline:
         """End of the line: what was held back comes out."""
         pulses, increments = self._through(self.decoder.close())
         rest = self._compensator.close()
-        rest = self.clock.stamp(rest[rest["t_ns"] > self._last_ns])
-        return Sampled(pulses, np.concatenate([increments, rest]))
+        if self._repeats:
+            rest = self._unrepeated(rest)
+        return Sampled(pulses, np.concatenate([increments, self.clock.stamp(rest)]))
 
     def exchange(self, coefficients: Coefficients) -> None:
         """Go over to another calibration between two samples.
@@ -86,6 +88,7 @@ class Pipeline:
             The new calibration.
         """
         self._next = Compensator(coefficients, self._layout, self._rate_filter)
+        self._repeats = True
 
     @property
     def exchanging(self) -> bool:
@@ -100,11 +103,8 @@ class Pipeline:
         increments = self._compensator.feed(pulses)
         if self._next is not None:
             increments = self._exchanged(self._next, pulses, increments)
-        # After an exchange one that lags more gives samples again that the one before has handed on.
-        if len(increments) and increments["t_ns"][0] <= self._last_ns:
-            increments = increments[increments["t_ns"] > self._last_ns]
-        if len(increments):
-            self._last_ns = int(increments["t_ns"][-1])
+        if self._repeats:
+            increments = self._unrepeated(increments)
         return Sampled(pulses, self.clock.stamp(increments))
 
     def _exchanged(self, new: Compensator, pulses: Records, old: Records) -> Records:
@@ -121,3 +121,12 @@ class Pipeline:
             old = np.concatenate([old, self._compensator.close()])
         self._compensator, self._next = new, None
         return np.concatenate([old[old["t_ns"] < since], fresh[fresh["t_ns"] >= since]])
+
+    def _unrepeated(self, increments: Records) -> Records:
+        """Leave out what was handed on: after an exchange, one that lags more gives some samples again."""
+        fresh = increments[increments["t_ns"] > self._last_ns]
+        if len(fresh):
+            # Nothing is repeated any more once the new one has come past what the old one gave.
+            self._repeats = self._next is not None or len(fresh) < len(increments)
+            self._last_ns = int(fresh["t_ns"][-1])
+        return fresh

@@ -50,6 +50,7 @@ _STARTED, _LAST, _FIRST, _SEEN, _ELAPSED, _HAVE_TOTALS, _LOST_BEFORE = range(7)
 _STRAY_DAMAGED, _STRAY_TORN = 7, 8  # since the newest number
 _TOTALS, _PREVIOUS = 9, 15  # six each
 _STATE_SIZE: Final = 21
+_NONE: Final = np.zeros(0, FRAME)
 _MISSING_BEFORE: Final = int(Flag.MISSING_BEFORE)
 _LONG_INTERVAL: Final = int(Flag.LONG_INTERVAL)
 _SATURATED: Final = int(Flag.SATURATED)
@@ -113,7 +114,7 @@ class Accountant:
         self._layout = layout
         self._state = np.zeros(_STATE_SIZE, np.int64)
         self._buckets = np.zeros(len(_BUCKETS), np.int64)
-        self._waiting = np.zeros(0, FRAME)
+        self._waiting = _NONE
         self._masks = np.array(layout.status, np.int64)
         self._degc = np.full((2, MAX_TEMPERATURES), np.nan)
         known = len(layout.temperature_names)
@@ -156,7 +157,7 @@ class Accountant:
             self._masks,
             self._degc,
         )
-        self._waiting = frames[len(frames) - waits :].copy()
+        self._waiting = frames[-1:].copy() if waits else _NONE
         return pulses[:count]
 
 
