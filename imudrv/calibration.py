@@ -36,7 +36,8 @@ Matrix9: TypeAlias = tuple[Row9, Row9, Row9, Row9, Row9, Row9, Row9, Row9, Row9]
 
 def _axes(matrix: Matrix3) -> Matrix3:
     C = np.array(matrix)
-    norms = np.concatenate([np.linalg.norm(C, axis=1), np.linalg.norm(C, axis=0)])
+    with np.errstate(over="ignore"):  # infinite is told below
+        norms = np.concatenate([np.linalg.norm(C, axis=1), np.linalg.norm(C, axis=0)])
     worst = norms[np.argmax(np.abs(norms - 1.0))]
     if abs(worst - 1.0) > NORM_TOLERANCE:
         raise ValueError(
@@ -53,7 +54,8 @@ def _axes(matrix: Matrix3) -> Matrix3:
 
 def _covariance(rows: Matrix9) -> Matrix9:
     P = np.array(rows)
-    asymmetry = float(np.max(np.abs(P - P.T)))
+    with np.errstate(over="ignore"):
+        asymmetry = float(np.max(np.abs(P - P.T)))
     if asymmetry > COVARIANCE_TOLERANCE_MM2:
         raise ValueError(
             f"expected a symmetric matrix, got entries that differ by {asymmetry:.3g} from their mirror"
@@ -89,8 +91,8 @@ def _range(limits: tuple[float, float]) -> tuple[float, float]:
 
 
 # Wide enough for any unit of the kind, narrow enough to catch another unit of measure.
-GyroScale = Annotated[float, Key(gt=0, le=1e4)]
-AccelerometerScale = Annotated[float, Key(gt=0, le=1e9)]
+GyroScale = Annotated[float, Key(gt=1e-9, le=1e4)]
+AccelerometerScale = Annotated[float, Key(gt=1e-9, le=1e9)]
 GyroBias = Annotated[float, Key(ge=-3600, le=3600)]
 AccelerometerBias = Annotated[float, Key(ge=-1e5, le=1e5)]
 GyroBiasSlope = Annotated[float, Key(ge=-100, le=100)]

@@ -18,32 +18,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from imudrv.calibration import write_calibration
 from imudrv.profiles import load
 from imudrv.receive import receive
 from imudrv.recording import Recording
 from imudrv.records import PULSES, Flag
+from imudrv.sim.scenario import NOMINAL
 from imudrv.status import ask
 from imudrv.wire.encode import StreamEncoder
 
 LAYOUT = load("imu50-rs422").layout()
 DEADLINE_S = 60.0
-CALIBRATION = """
-format: imu50-calibration
-version: 1
-serial_number: "50-0017"
-created: 2026-11-22T10:00:00Z
-gyro:
-  scale_arcsec_per_pulse: [0.5, 0.5, 0.5]
-  bias_deg_per_h: [0.0, 0.0, 0.0]
-  C_bg: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
-accelerometer:
-  scale_pulse_per_m_s: [2000.0, 2000.0, 2000.0]
-  bias_ug: [0.0, 0.0, 0.0]
-  C_ba: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
-size_effect:
-  r_mm: {x: [24, -11, -9], y: [-23, 29, -7], z: [-1, -18, 16]}
-  gauge: centroid
-"""
 
 
 def frames(first: int, count: int) -> bytes:
@@ -162,7 +147,7 @@ def serving(folder: Path, *arguments: object) -> Iterator[Service]:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    (tmp_path / "unit.yaml").write_text(CALIBRATION)
+    write_calibration(tmp_path / "unit.yaml", NOMINAL)
     return tmp_path
 
 
@@ -241,12 +226,13 @@ def test_a_calibration_is_exchanged_while_running_and_a_bad_one_is_refused(folde
     with serving(folder, *serial(folder), "--record", "run.mcap") as service:
         unit.send(200)
         before = service.status()["calibration"]["sha256"]
-        (folder / "unit.yaml").write_text(CALIBRATION.replace("[0.5, 0.5, 0.5]", "[0.5, 0.5, half]"))
+        calibration = (folder / "unit.yaml").read_text()
+        (folder / "unit.yaml").write_text(calibration.replace("[0.5, 0.5, 0.5]", "[0.5, 0.5, half]"))
         until(lambda: service.status()["calibration"]["refused"], "the bad file refused")
         assert "scale_arcsec_per_pulse[2]" in service.status()["calibration"]["refused"]
         assert service.status()["calibration"]["sha256"] == before
 
-        (folder / "unit.yaml").write_text(CALIBRATION.replace("[0.5, 0.5, 0.5]", "[1.0, 1.0, 1.0]"))
+        (folder / "unit.yaml").write_text(calibration.replace("[0.5, 0.5, 0.5]", "[1.0, 1.0, 1.0]"))
         service.process.send_signal(signal.SIGHUP)
         until(lambda: service.status()["calibration"]["exchanges"] == 1, "the good one taken")
         status = service.status()["calibration"]
@@ -269,7 +255,7 @@ def test_a_calibration_of_another_unit_is_refused_at_the_start(folder: Path) -> 
     command = [sys.executable, "-m", "imudrv", "run", *map(str, serial(folder)), "--unit", "50-0018"]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300)
     assert done.returncode == 2
-    assert "50-0017" in done.stderr
+    assert "nominal" in done.stderr
     assert "Traceback" not in done.stderr
 
 

@@ -20,9 +20,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from imudrv.calibration import write_calibration
 from imudrv.process import quiet_memory
 from imudrv.profiles import load
 from imudrv.records import PULSES
+from imudrv.sim.scenario import NOMINAL
 from imudrv.wire.datagram import SIZE
 from imudrv.wire.encode import StreamEncoder
 
@@ -31,23 +33,6 @@ FRAME: Final = LAYOUT.messages[0].length
 TAU_S: Final = 1e-3
 SETTLE: Final = 500
 """Samples at the beginning that do not count: caches, branch predictors and the scheduler find their way."""
-CALIBRATION: Final = """
-format: imu50-calibration
-version: 1
-serial_number: "bench"
-created: 2026-11-22T10:00:00Z
-gyro:
-  scale_arcsec_per_pulse: [0.5, 0.5, 0.5]
-  bias_deg_per_h: [0.0, 0.0, 0.0]
-  C_bg: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
-accelerometer:
-  scale_pulse_per_m_s: [2000.0, 2000.0, 2000.0]
-  bias_ug: [0.0, 0.0, 0.0]
-  C_ba: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
-size_effect:
-  r_mm: {x: [24, -11, -9], y: [-23, 29, -7], z: [-1, -18, 16]}
-  gauge: centroid
-"""
 BARE: Final = """
 import gc, os, select, socket, sys
 path, port = sys.argv[1], int(sys.argv[2])
@@ -102,7 +87,7 @@ def one_round(samples: int, service: bool, folder: Path) -> NDArray[np.float64]:
     inlet.bind(("127.0.0.1", 0))
     port = inlet.getsockname()[1]
     if service:
-        (folder / "unit.yaml").write_text(CALIBRATION)
+        write_calibration(folder / "unit.yaml", NOMINAL)
         command = [sys.executable, "-m", "imudrv", "run", "--port", path, "--profile", LAYOUT.name]
         command += ["--calibration", str(folder / "unit.yaml"), "--out", f"udp://127.0.0.1:{port}"]
         command += ["--status", str(folder / "status.sock")]

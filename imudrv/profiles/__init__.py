@@ -21,7 +21,7 @@ from imudrv.wire import layout as wire
 NumberType = Literal["u8", "i8", "u16", "i16", "u24", "i24", "u32", "i32"]
 Offset = Annotated[int, Key(ge=0, le=4095)]
 Byte = Annotated[int, Key(ge=0, le=255)]
-Hex = Annotated[str, Key(pattern=r"^\s*([0-9A-Fa-f]{2}\s*)+$", max_length=64)]
+Hex = Annotated[str, Key(pattern=r"^[ \t]*([0-9A-Fa-f]{2}[ \t]*)+$", max_length=64)]
 Name = Annotated[str, Key(pattern=r"^[A-Za-z0-9_.-]+$", max_length=64)]
 
 _AXES = ("x", "y", "z")
@@ -45,8 +45,8 @@ class Number(Model):
         ]
         | None
     ) = None
-    degc_per_count: Annotated[float, Key(gt=0)] = 1.0
-    degc_at_zero: float = 0.0
+    degc_per_count: Annotated[float, Key(gt=0, le=1000)] = 1.0
+    degc_at_zero: Annotated[float, Key(ge=-1000, le=1000)] = 0.0
 
     @model_validator(mode="after")
     def _named_whole(self) -> Self:
@@ -98,7 +98,7 @@ class Message(Model):
     """One kind of message of the unit."""
 
     id: Annotated[int, Key(ge=0, le=0x1FFFFFFF)] | None = None
-    every: Annotated[int, Key(ge=1, le=1_000_000)] = 1
+    every: Annotated[int, Key(ge=1, le=1000)] = 1
     sync: Hex | None = None
     length: Annotated[int, Key(ge=1, le=4096)]
     constants: tuple[Constant, ...] = ()
@@ -171,7 +171,7 @@ class Profile(Model):
     name: Name
     transport: Literal["serial", "can"]
     line: SerialLine | CanLine
-    sample_rate_hz: Annotated[float, Key(gt=0, le=100_000)]
+    sample_rate_hz: Annotated[float, Key(ge=1, le=100_000)]
     byte_order: Literal["little", "big"]
     counts: Literal["increment", "total"]
     nominal: Nominal
