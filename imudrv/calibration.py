@@ -268,12 +268,32 @@ def read_calibration(path: str | os.PathLike[str], unit: str | None = None) -> C
         The file cannot be read, has faults, or is the certificate of another unit.
     """
     calibration = read(path, Calibration)
+    require_unit(calibration, unit, os.fspath(path))
+    return calibration
+
+
+def require_unit(calibration: Calibration, unit: str | None, name: str) -> None:
+    """Make sure that a calibration belongs to the unit.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The certificate.
+    unit : str or None
+        Serial number of the unit that is connected; None: any.
+    name : str
+        What the message calls the certificate.
+
+    Raises
+    ------
+    InputError
+        It is the certificate of another unit.
+    """
     if unit is not None and unit != calibration.serial_number:
         raise InputError(
-            f"{os.fspath(path)}: expected the calibration of unit {unit!r}, "
+            f"{name}: expected the calibration of unit {unit!r}, "
             f"got that of {calibration.serial_number!r}; give the connected unit's file, or connect that unit"
         )
-    return calibration
 
 
 def write_calibration(path: str | os.PathLike[str], calibration: Calibration) -> None:

@@ -9,7 +9,7 @@ from typing import TypeAlias
 from rich.console import Console
 
 from imudrv import config, profiles, settings
-from imudrv.calibration import Calibration, coefficients, read_calibration
+from imudrv.calibration import Calibration, coefficients, read_calibration, require_unit
 from imudrv.captures import Capture
 from imudrv.config import Model
 from imudrv.console import BAD_INPUT, OK, guarded, progress
@@ -170,6 +170,7 @@ def _compensate(arguments: argparse.Namespace) -> None:
         calibration = read_calibration(arguments.calibration, arguments.unit)
         origin = f"calibration {config.sha256(arguments.calibration)[:12]}"
     elif capture.recording is not None and (recorded := capture.recording.calibration) is not None:
+        require_unit(recorded, arguments.unit, str(arguments.capture))
         calibration, origin = recorded, "calibration of the recording"
     else:
         raise InputError("expected --calibration, for only a recording of the service has one in it")

@@ -1,0 +1,302 @@
+"""The command `calib`: arguments in, one function a command, plain words out."""
+
+import argparse
+import re
+from collections.abc import Callable, Sequence
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, Final, Literal, TypeAlias, get_args
+
+import yaml
+from pydantic import ConfigDict, JsonValue
+from rich.console import Console
+
+from calib.certificate import (
+    CHANGED,
+    FOUND,
+    arms_of,
+    certificate,
+    check_target,
+    result_document,
+    with_arms,
+    write,
+    write_json,
+)
+from calib.findings import Basis, find
+from calib.gauge import GAUGES, Arms, Gauge, convert, from_kalibr, from_psins, to_kalibr, to_psins
+from calib.identify import Extra
+from calib.report import arms_text, report_for_terminal, report_html, report_text
+from imudrv import config, profiles
+from imudrv.calibration import Calibration, read_calibration
+from imudrv.config import Model
+from imudrv.console import guarded, progress
+from imudrv.errors import InputError
+from imudrv.recording import Recording
+from imudrv.sinks.files import replacing
+from imudrv.site import Site
+from imudrv.units import MM
+
+Command: TypeAlias = Callable[[argparse.Namespace], int | None]
+Stated: TypeAlias = tuple[Literal["x", "y", "z"], list[float]]
+
+EXTRAS: Final[tuple[Extra, ...]] = get_args(Extra)
+PROGRAMS: Final = ("kalibr", "psins")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Parameters
+    ----------
+    argv : sequence of str, optional
+        Arguments; those of the process if absent.
+
+    Returns
+    -------
+    int
+        Exit code, see `imudrv.console`.
+    """
+    arguments = _parser().parse_args(argv)
+    command: Command = arguments.command
+    return guarded(lambda: command(arguments))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="calib", description="Inner lever arms of a 50-type ring-laser-gyro IMU."
+    )
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    def add(name: str, command: Command, text: str) -> argparse.ArgumentParser:
+        sub = commands.add_parser(name, help=text, description=text)
+        sub.set_defaults(command=command)
+        return sub
+
+    def add_gauge(sub: argparse.ArgumentParser, option: str, **more: Any) -> None:
+        sub.add_argument(option, dest="gauge", choices=GAUGES, help="where the origin of b is put", **more)
+        sub.add_argument(
+            "--at",
+            metavar="A=X,Y,Z",
+            help="for given: where accelerometer A senses, mm, from a drawing; such as y=12.5,-3,40",
+        )
+
+    sub = add("identify", _identify, "Captures of rotations to lever arms, certificate and report.")
+    sub.add_argument(
+        "captures",
+        type=Path,
+        nargs="+",
+        metavar="CAPTURE",
+        help="wire bytes, candump logs, recordings (.mcap)",
+    )
+    sub.add_argument(
+        "--profile", metavar="P", help=f"{', '.join(profiles.shipped())}, or a file; recordings know theirs"
+    )
+    sub.add_argument(
+        "--calibration", type=Path, metavar="C.yaml", help="the unit's; default: the recordings' own"
+    )
+    sub.add_argument("--site", type=Path, required=True, metavar="S.yaml", help="where the unit stood")
+    sub.add_argument("--unit", metavar="SERIAL", help="serial number of the unit; another one's is refused")
+    sub.add_argument("--method", choices=("joint", "plain"), default="joint", help="default: joint")
+    add_gauge(sub, "--gauge")
+    sub.add_argument(
+        "--pivot",
+        choices=("free", "fixed"),
+        default="free",
+        help="fixed: the origin of b is known to stay still, as on a turntable; all nine are then told",
+    )
+    sub.add_argument(
+        "--estimate", type=_extras, default=(), metavar="WHAT", help=f"more unknowns: {','.join(EXTRAS)}"
+    )
+    sub.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="NEW.yaml", help="the certificate to write"
+    )
+    sub.add_argument("--json", type=Path, metavar="R.json", help="the whole result, for programs")
+    sub.add_argument("--report", type=Path, metavar="R.html", help="the report with figures, one file")
+
+    sub = add("gauge", _gauge, "A certificate's lever arms in another gauge, exactly, with their covariance.")
+    sub.add_argument("file", type=Path, help="the certificate")
+    add_gauge(sub, "--to", required=True)
+    sub.add_argument("-o", "--output", type=Path, required=True, metavar="NEW.yaml")
+
+    sub = add("export-arms", _export_arms, "A certificate's lever arms as another program writes them.")
+    sub.add_argument("file", type=Path, help="the certificate")
+    sub.add_argument("--to", choices=PROGRAMS, required=True, help="kalibr: YAML; psins: MATLAB")
+
+    sub = add("import-arms", _import_arms, "Lever arms that another program found, into a certificate.")
+    sub.add_argument(
+        "file",
+        type=Path,
+        help="Kalibr's imu.yaml; of PSINS what clbtfile writes (cm), or lines clbt.rx = [...] (m)",
+    )
+    sub.add_argument("--from", dest="program", choices=PROGRAMS, required=True, help="who wrote it")
+    sub.add_argument("--calibration", type=Path, required=True, metavar="C.yaml", help="the unit's")
+    sub.add_argument("-o", "--output", type=Path, required=True, metavar="NEW.yaml")
+    return parser
+
+
+def _identify(arguments: argparse.Namespace) -> None:
+    stated = _stated(arguments.at)
+    basis = _basis(arguments)
+    check_target(arguments.output, basis.calibration)
+    site = config.read(arguments.site, Site)
+    profile = profiles.load(arguments.profile) if arguments.profile else None
+    size = sum(path.stat().st_size for path in arguments.captures if path.exists())
+    with progress("identify", 2 * size) as advance:  # each capture is read twice
+        findings = find(
+            arguments.captures,
+            profile,
+            basis,
+            site,
+            method=arguments.method,
+            pivot=arguments.pivot,
+            nine=arguments.gauge == "given" and stated is None,
+            extra=arguments.estimate,
+            advance=advance,
+        )
+    arms = _wanted(findings.arms, arguments.gauge, stated)
+    told = (arms, convert(arms, "x" if arms.gauge == "centroid" else "centroid"))
+    written = []
+    try:  # files first: whoever reads the text may leave
+        if arguments.json is not None:
+            write_json(arguments.json, result_document(findings, arms))
+            written.append(f"{arguments.json}: the result")
+        if arguments.report is not None:
+            with replacing(arguments.report) as file:
+                file.write(report_html(findings, told).encode())
+            written.append(f"{arguments.report}: the report")
+        write(arguments.output, certificate(findings, arms))
+        written.append(_written(arguments.output, basis.calibration, arms))
+    finally:
+        console = Console(highlight=False)
+        if console.is_terminal:
+            console.print(report_for_terminal(findings, told))
+        else:
+            print(report_text(findings, told), end="")
+        print(*written, sep="\n")
+
+
+def _written(path: Path, calibration: Calibration, arms: Arms) -> str:
+    return f"{path}: certificate of unit {calibration.serial_number}, gauge {arms.gauge}"
+
+
+def _wanted(arms: Arms, gauge: Gauge | None, stated: Stated | None) -> Arms:
+    """The arms in the gauge asked for; nobody asked: in that of the estimate."""
+    if stated is None and gauge in (None, arms.gauge):
+        return arms
+    if gauge is None:
+        raise InputError("--at: expected with --gauge given")
+    return convert(arms, gauge, stated)
+
+
+def _basis(arguments: argparse.Namespace) -> Basis:
+    """The calibration given, or the one that the recordings agree on."""
+    if arguments.calibration is not None:
+        calibration = read_calibration(arguments.calibration, arguments.unit)
+        return Basis(calibration, arguments.calibration.name, config.sha256(arguments.calibration))
+    texts: dict[str, str] = {}
+    for path in arguments.captures:
+        text = Recording(path).calibration_text if path.suffix == ".mcap" else None
+        if text is None:
+            raise InputError(f"{path}: expected --calibration, for there is none in it")
+        texts.setdefault(text, str(path))
+    if len(texts) > 1:
+        raise InputError(
+            f"expected recordings made with one calibration, got others in {' and '.join(texts.values())}; "
+            "say which with --calibration"
+        )
+    ((text, path),) = texts.items()
+    calibration = config.parse_text(text.encode(), Calibration, f"{path}: calibration")
+    if arguments.unit not in (None, calibration.serial_number):
+        raise InputError(
+            f"{path}: expected a recording of unit {arguments.unit!r}, "
+            f"got one of {calibration.serial_number!r}"
+        )
+    return Basis(calibration, f"calibration in {Path(path).name}", sha256(text.encode()).hexdigest())
+
+
+def _gauge(arguments: argparse.Namespace) -> None:
+    calibration = read_calibration(arguments.file)
+    before = arms_of(calibration, str(arguments.file))
+    stated = _stated(arguments.at)
+    arms = convert(before, arguments.gauge, stated)
+    how: dict[str, Any] = {
+        "from": before.gauge,
+        "to": arms.gauge,
+        "file_sha256": config.sha256(arguments.file),
+    }
+    if stated is not None:
+        how["stated_mm"] = {stated[0]: [value / MM for value in stated[1]]}
+    write(arguments.output, with_arms(calibration, arms, CHANGED, how))
+    print(arms_text(arms), end="")
+    print(_written(arguments.output, calibration, arms))
+
+
+def _export_arms(arguments: argparse.Namespace) -> None:
+    arms = arms_of(read_calibration(arguments.file), str(arguments.file))
+    if arguments.to == "kalibr":
+        print("# lever arms of the accelerometers, m, origin at that of x")
+        print(yaml.safe_dump({"imu0": to_kalibr(arms)}, sort_keys=False, default_flow_style=None), end="")
+        return
+    print(f"% lever arms of the accelerometers, m, gauge {arms.gauge}")
+    for name, r in to_psins(arms).items():
+        print(f"clbt.{name} = [{'; '.join(map(str, r))}];")
+
+
+def _import_arms(arguments: argparse.Namespace) -> None:
+    calibration = read_calibration(arguments.calibration)
+    if arguments.program == "kalibr":
+        arms = from_kalibr(config.read(arguments.file, _Kalibr).imu0)
+    else:
+        arms = from_psins(_clbt(arguments.file))
+    how = {"method": f"imported from {arguments.program}", "file_sha256": config.sha256(arguments.file)}
+    write(arguments.output, with_arms(calibration, arms, FOUND, how))
+    print(arms_text(arms), end="")
+    print(_written(arguments.output, calibration, arms))
+
+
+class _Kalibr(Model):
+    """What matters of the IMU file that Kalibr writes."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    imu0: dict[str, JsonValue]
+
+
+def _clbt(path: Path) -> dict[str, list[float]]:
+    """Rows of MATLAB text, m: `clbt.rx = [...]` of a program is in m, `rx = [...]` of `clbtfile` in cm."""
+    try:
+        text = path.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise InputError(f"{path}: expected MATLAB text, cannot read it: {error.strerror}") from error
+    rows = {}
+    for prefix, name, row in re.findall(r"^\s*(clbt\.)?(r[xyz])\s*=\s*\[([^\]]*)\]", text, re.MULTILINE):
+        try:
+            values = [float(value) for value in re.split(r"[\s;,]+", row.strip())]
+        except ValueError:
+            raise InputError(f"{path}: {name}: expected three numbers, got {row.strip()[:60]!r}") from None
+        rows[name] = values if prefix else [value * 1e-2 for value in values]
+    return rows
+
+
+def _extras(text: str) -> tuple[Extra, ...]:
+    names = tuple(text.split(","))
+    if unknown := [name for name in names if name not in EXTRAS]:
+        raise argparse.ArgumentTypeError(f"expected {' or '.join(EXTRAS)}, got {unknown[0]!r}")
+    return tuple(name for name in EXTRAS if name in names)
+
+
+def _stated(text: str | None) -> Stated | None:
+    """Take `y=12.5,-3,40` apart."""
+    if text is None:
+        return None
+    accelerometer, _, rest = text.partition("=")
+    try:
+        point = [float(value) * MM for value in rest.split(",")]
+    except ValueError:
+        point = []
+    for name in ("x", "y", "z"):
+        if accelerometer == name and len(point) == 3:
+            return name, point
+    raise InputError(
+        f"--at: expected an accelerometer and three numbers in mm, such as y=12.5,-3,40, got {text!r}"
+    )

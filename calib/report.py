@@ -1,0 +1,698 @@
+"""The report of an identification: one content, as text for a terminal and as one HTML file.
+
+A report is a function of the findings: it tells, and computes nothing but means, extremes and other units.
+"""
+
+from base64 import b64encode
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from html import escape
+from io import StringIO
+from itertools import chain
+from math import floor, hypot, log10
+from typing import Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from rich import box
+from rich.console import Console, Group, RenderableType
+from rich.padding import Padding
+from rich.table import Table as RichTable
+from rich.text import Text as RichText
+from scipy.special import chdtri
+
+from calib import plots
+from calib.findings import Findings, Source, scatter
+from calib.gauge import Arms
+from calib.identify import Identification, Nuisance, RunResult
+from calib.runs import Priors, Run
+from imudrv.units import ARCSEC, DEG, DEG_PER_H, MM, PPM, STANDARD_GRAVITY, UG, URAD
+
+Array = NDArray[np.float64]
+
+WIDTH: Final = 80
+"""Columns of the text."""
+LONG: Final = 15
+"""A table of more rows may be broken by a page's end."""
+
+
+@dataclass(frozen=True)
+class Paragraph:
+    """Running text."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """What and how much."""
+
+    rows: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows under a head; the first column is text, the others numbers."""
+
+    title: str
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A figure, drawn where it is shown."""
+
+    title: str
+    draw: Callable[[], bytes]
+
+
+Block: TypeAlias = Paragraph | Pairs | Table | Drawing
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the report with its heading."""
+
+    title: str
+    blocks: tuple[Block, ...]
+
+
+def report_text(findings: Findings, arms: Sequence[Arms]) -> str:
+    """Tell the findings as plain text of 80 columns.
+
+    Parameters
+    ----------
+    findings : Findings
+        What was found.
+    arms : sequence of Arms
+        The lever arms in each gauge that is to be told, the one asked for first.
+
+    Returns
+    -------
+    str
+        Lines.
+    """
+    return _text(report_for_terminal(findings, arms))
+
+
+def report_for_terminal(findings: Findings, arms: Sequence[Arms]) -> RenderableType:
+    """The same for a console of rich's."""
+    sections = _sections(findings, arms)
+    parts: list[RenderableType] = [
+        RichText(_title(findings), style="bold"),
+        RichText(_subtitle(findings)),
+        "",
+    ]
+    for section in sections:
+        parts += [RichText(section.title.upper(), style="bold")]
+        parts += chain.from_iterable(_shown(block) for block in section.blocks)
+    return Group(*parts)
+
+
+def arms_text(arms: Arms) -> str:
+    """Tell lever arms alone, with their gauge, as plain text."""
+    return _text(Group(*_shown(_arms_table(arms))))
+
+
+def report_html(findings: Findings, arms: Sequence[Arms]) -> str:
+    """Tell the findings as one HTML file, figures inside, nothing loaded from elsewhere.
+
+    Parameters
+    ----------
+    findings, arms
+        As for `report_text`.
+
+    Returns
+    -------
+    str
+        The file.
+    """
+    body = "\n".join(
+        f"<section>\n<h2>{escape(section.title)}</h2>\n{''.join(map(_marked_up, section.blocks))}</section>"
+        for section in _sections(findings, arms)
+    )
+    return _PAGE.format(
+        style=_STYLE, title=escape(_title(findings)), subtitle=escape(_subtitle(findings)), body=body
+    )
+
+
+# The content
+
+
+def _title(findings: Findings) -> str:
+    return f"Inner lever arms of unit {printable(findings.basis.calibration.serial_number)}"
+
+
+def _subtitle(findings: Findings) -> str:
+    return f"Identification of {findings.created:%Y-%m-%d %H:%M} UTC, {findings.software}"
+
+
+def _sections(findings: Findings, arms: Sequence[Arms]) -> tuple[Section, ...]:
+    return (
+        Section("Result", tuple(_result(findings, arms))),
+        Section("What was measured", tuple(_measured(findings))),
+        Section("Rotations", tuple(_rotations(findings))),
+        Section("Motions that do not serve", tuple(_rejected(findings.sources))),
+        Section("Velocity before and after", tuple(_velocities(findings.result))),
+        Section("The estimate", tuple(_estimate(findings))),
+        Section("Limits", tuple(Paragraph(text) for text in _limits(findings, arms[0]))),
+    )
+
+
+def _result(findings: Findings, arms: Sequence[Arms]) -> Iterator[Block]:
+    result = findings.result
+    yield Pairs(tuple(verdict(findings)))
+    yield Paragraph("u is the standard uncertainty (k = 1), U the expanded one (k = 2).")
+    for told in arms:
+        yield _arms_table(told)
+    sigma = result.differences_sigma
+    decimals = _decimals(sigma)
+    yield Table(
+        "Differences of the sensing points, mm: the same in every gauge",
+        ("", "value", "u", "U"),
+        tuple(
+            (
+                f"r_x - r_{other}, {axis}",
+                f"{result.differences[i, j] / MM:+.{decimals}f}",
+                f"{sigma[i, j] / MM:.{decimals}f}",
+                f"{2.0 * sigma[i, j] / MM:.{decimals}f}",
+            )
+            for i, other in enumerate("yz")
+            for j, axis in enumerate("XYZ")
+        ),
+    )
+    C_ba = findings.basis.calibration.accelerometer.C_ba_array
+    yield Drawing(
+        f"Sensing points, gauge {arms[0].gauge}, and sensing directions. Grey cross: origin of b; dot in a "
+        "circle: towards the reader, cross in it: away",
+        lambda: plots.sensing_points(arms[0].r_b, C_ba),
+    )
+
+
+def _arms_table(arms: Arms) -> Table:
+    """Nine numbers, with their gauge."""
+    head: tuple[str, ...] = ("", "X", "Y", "Z")
+    values = arms.r_b / MM
+    if arms.covariance is None:
+        rows = [(f"r_{i}", *(f"{v:+.3f}" for v in values[k])) for k, i in enumerate("xyz")]
+        return Table(f"Sensing points in body axes, mm, gauge {arms.gauge}", head, tuple(rows))
+    sigma = np.sqrt(np.maximum(np.diag(arms.covariance), 0.0)).reshape(3, 3) / MM
+    decimals = _decimals(sigma * MM)
+    return Table(
+        f"Sensing points in body axes, mm, gauge {arms.gauge}",
+        (*head, "u(X)", "u(Y)", "u(Z)"),
+        tuple(
+            (
+                f"r_{i}",
+                *(f"{v + 0.0:+.{decimals}f}" for v in values[k]),
+                *(f"{s:.{decimals}f}" for s in sigma[k]),
+            )
+            for k, i in enumerate("xyz")
+        ),
+    )
+
+
+def verdict(findings: Findings) -> Iterator[tuple[str, str]]:
+    """Judge the findings.
+
+    Parameters
+    ----------
+    findings : Findings
+        What was found.
+
+    Yields
+    ------
+    (str, str)
+        'good', 'note', 'caution' or 'bad', and why, in a sentence.
+    """
+    result = findings.result
+    worst = float(result.differences_sigma.max())
+    nine = result.gauge == "given"
+    yield (
+        "good",
+        f"{'All nine components' if nine else 'The six differences'} of the sensing points are determined by "
+        f"{_count(len(result.runs), 'rotation')}, method {result.method}; the largest standard uncertainty "
+        f"of a difference is {worst / MM:.3f} mm.",
+    )
+    yield _agreement(result)
+    shifts = [
+        (one.label, float(np.abs(one.shift_m).max())) for one in result.left_out if one.shift_m is not None
+    ]
+    if shifts:
+        label, shift = max(shifts, key=lambda item: item[1])
+        yield (
+            "note",
+            f"Leaving out one rotation changes no component by more than {shift / MM:.3f} mm "
+            f"({printable(label)}).",
+        )
+    else:
+        yield (
+            "caution",
+            "No rotation is redundant, so that none checks the others; a second set, turned the other way, "
+            "does.",
+        )
+    for k, run in enumerate(findings.runs):
+        if run.aligned.motion is not None:
+            yield "caution", f"Run {k + 1} moved while it was aligned: {printable(run.aligned.motion)}."
+    for note in result.notes:
+        yield "caution", f"{printable(note)}."
+
+
+def _agreement(result: Identification) -> tuple[str, str]:
+    n = result.degrees_of_freedom
+    if n == 0:
+        return "caution", "As many equations as unknowns: no residuals, nothing to judge the model by."
+    low, high = float(chdtri(n, 0.975)), float(chdtri(n, 0.025))
+    told = (
+        f"chi-square {result.chi_square:.1f} with {n} degrees of freedom, 95 % band {low:.1f} to {high:.1f}"
+    )
+    if not result.consistent:
+        return "bad", f"The velocities contradict the model: {told}. No certificate rests on them."
+    if result.chi_square > high:
+        return (
+            "caution",
+            f"The velocities scatter more than chance allows: {told}. The uncertainties may be too small "
+            f"by a factor of {(result.chi_square / n) ** 0.5:.2f}.",
+        )
+    if result.chi_square < low:
+        return (
+            "caution",
+            f"The velocities scatter less than expected: {told}. The uncertainties are cautious.",
+        )
+    return "good", f"The velocities agree with the model: {told}."
+
+
+def _measured(findings: Findings) -> Iterator[Block]:
+    basis, site, result = findings.basis, findings.site, findings.result
+    gravity = "normal gravity" if site.gravity_m_s2 is None else f"gravity {site.gravity_m_s2:.6f} m/s^2"
+    yield Pairs(
+        (
+            ("unit", printable(basis.calibration.serial_number)),
+            ("calibration", f"{printable(basis.name)} of {basis.calibration.created:%Y-%m-%d}"),
+            ("SHA-256", basis.sha256),
+            (
+                "site",
+                f"latitude {site.latitude_deg:.6f} deg, longitude {site.longitude_deg:.6f} deg, "
+                f"height {site.height_m:.1f} m, {gravity}",
+            ),
+            ("method", _METHODS[result.method]),
+            ("pivot", "the origin of b, known to stay still" if result.gauge == "given" else "not known"),
+        )
+    )
+    for source in findings.sources:
+        warm = ", ".join(
+            f"{channel.replace('_', ' ')} {least:.1f} to {most:.1f}"
+            for channel, least, most in source.temperatures
+        )
+        yield Pairs(
+            (
+                ("capture", f"{printable(source.name)}, {printable(source.profile)}"),
+                ("SHA-256", source.sha256),
+                ("contents", f"{source.evidence.segments.duration_s:.1f} s; {source.books}"),
+                ("temperature", f"{warm} degC" if warm else "not told by the unit"),
+            )
+        )
+
+
+def _rotations(findings: Findings) -> Iterator[Block]:
+    limits = findings.limits
+    yield Paragraph(
+        f"A rotation serves if it turns {limits.angle_deg:g} +- {limits.angle_tolerance_deg:g} deg, with a "
+        f"peak of {limits.least_peak_deg_per_s:g} deg/s at least, about an axis {limits.axis_tilt_deg:g} deg "
+        f"off the vertical at most, after {limits.rest_before_s:g} s of rest and before "
+        f"{limits.rest_after_s:g} s, with {_count(limits.missing, 'sample')} missing at most, no axis "
+        "saturated and no fault told."
+    )
+    for k, (run, told) in enumerate(zip(findings.runs, findings.result.runs, strict=True)):
+        rotation, aligned = run.rotation, run.aligned
+        before, after = rotation.before, rotation.after
+        assert before is not None
+        assert after is not None
+        yield Pairs(
+            (
+                (f"run {k + 1}", printable(run.label)),
+                (
+                    "rotation",
+                    f"{rotation.angle_deg:+.2f} deg about {rotation.axis} up, {rotation.duration_s:.2f} s, "
+                    f"peak {rotation.peak_deg_per_s:.1f} deg/s, axis {rotation.axis_tilt_deg:.2f} deg off "
+                    "the vertical",
+                ),
+                (
+                    "rests",
+                    f"{before.duration_s:.1f} s before, {after.duration_s:.1f} s after; "
+                    f"{_count(rotation.missing, 'sample')} missing in the rotation, "
+                    f"{before.missing + after.missing} in the rests",
+                ),
+                (
+                    "alignment",
+                    f"{aligned.duration_s:.1f} s: heading {aligned.heading_rad / DEG:.3f} deg, u "
+                    f"{aligned.heading_sigma_rad / DEG:.3f} deg; level u "
+                    f"{aligned.level_sigma_rad / ARCSEC:.1f} arcsec; "
+                    f"{printable(aligned.motion) if aligned.motion else 'stood still'}",
+                ),
+                ("verdict", "serves: within all limits"),
+            )
+        )
+        yield Table(
+            "V, mm/s, and H, m/s per m of each component, after the rotation",
+            ("", "east", "north", "up"),
+            (
+                ("V", *(f"{v / MM:+.2f}" for v in told.V_n)),
+                *(
+                    (f"H, r_{i} {axis}", *(f"{h + 0.0:+.4f}" for h in told.H[:, 3 * i_at + axis_at]))
+                    for i_at, i in enumerate("xyz")
+                    for axis_at, axis in enumerate("XYZ")
+                ),
+            ),
+        )
+        yield Drawing(
+            f"Run {k + 1}. Grey: the rotation. A constant offset is that of the first velocity, from pulses",
+            _drawn(run, told),
+        )
+
+
+def _drawn(run: Run, told: RunResult) -> Callable[[], bytes]:
+    return lambda: plots.velocities(run, told)
+
+
+def _rejected(sources: Sequence[Source]) -> Iterator[Block]:
+    rejected = [(source.name, *one) for source in sources for one in source.evidence.rejected]
+    for name, rotation, reasons in rejected:
+        yield Pairs(
+            (
+                (
+                    "motion",
+                    f"{printable(name)} from {rotation.start_s:.1f} to {rotation.stop_s:.1f} s, "
+                    f"{rotation.angle_deg:+.1f} deg about {rotation.axis} up",
+                ),
+                *(("rejected", reason) for reason in reasons),
+            )
+        )
+    if not rejected:
+        yield Paragraph("None: every motion in the captures serves.")
+
+
+def _velocities(result: Identification) -> Iterator[Block]:
+    def size(v_n: Array) -> float:
+        return hypot(v_n[0], v_n[1]) / MM
+
+    yield Table(
+        "Horizontal velocity after the rotation, mm/s",
+        ("run", "measured", "left", "ratio", "scatter"),
+        tuple(
+            (
+                f"{k + 1}  {printable(run.label)}",
+                f"{size(run.V_n):.2f}",
+                f"{size(run.compensated_n):.2f}",
+                f"{size(run.compensated_n) / size(run.V_n):.1%}",
+                f"{scatter(run) / MM:.3f}",
+            )
+            for k, run in enumerate(result.runs)
+        ),
+    )
+    yield Paragraph(
+        "'Left' is V - H R, the size effect taken off and nothing else: what remains is residual bias, tilt "
+        "and misalignment. 'Scatter' is the rms of the residuals at rest about their mean."
+    )
+    yield Drawing(
+        "Horizontal velocity before and after compensation", lambda: plots.before_after(result.runs)
+    )
+
+
+def _estimate(findings: Findings) -> Iterator[Block]:
+    result, priors = findings.result, findings.priors
+    yield Paragraph(f"Observability. {result.reason[:1].upper()}{result.reason[1:]}.")
+    yield Table(
+        "Principal directions of (r_x, r_y, r_z): u, mm. Singular values of the stacked H: s, m/s per m",
+        ("", *(str(k) for k in range(1, 10))),
+        (
+            ("u", *(_three(s / MM) for s in result.direction_sigma)),
+            ("s", *(_three(s) for s in result.singular_values)),
+        ),
+    )
+    yield Drawing(
+        f"Standard uncertainty of each direction; worse than {priors.arm / MM:g} mm is not seen",
+        lambda: plots.directions(result.direction_sigma, result.rank, priors.arm),
+    )
+    yield Paragraph(f"Consistency. {_agreement(result)[1]}")
+    noise = result.noise
+    yield Pairs(
+        (
+            (
+                "gyros",
+                f"angle random walk {noise.angle_walk / DEG * 60.0:.5f} deg/sqrt(h), found in the rests",
+            ),
+            (
+                "level accels",
+                f"velocity random walk {noise.velocity_walk * 60.0:.5f} m/s/sqrt(h), white noise "
+                f"{noise.velocity_white / MM:.4f} mm/s, found in the rests",
+            ),
+        )
+    )
+    yield Table("What was taken to be known before", ("", "u"), tuple(priors_told(priors)))
+    if result.nuisances:
+        names = _names(result)
+        yield Table(
+            "Estimated beside the arms",
+            ("", "value", "u", "u before", ""),
+            tuple(_nuisance(n, words) for n, words in zip(result.nuisances, names, strict=True)),
+        )
+        yield _correlations(findings, names)
+    if result.left_out:
+        yield Table(
+            "Each rotation left out in turn: largest change of r_x, r_y, r_z, mm",
+            ("without", "rank", "r_x", "r_y", "r_z"),
+            tuple(
+                (
+                    printable(one.label),
+                    str(one.rank),
+                    *(
+                        ("not seen",) * 3
+                        if one.shift_m is None
+                        else (f"{np.abs(row).max() / MM:.3f}" for row in one.shift_m)
+                    ),
+                )
+                for one in result.left_out
+            ),
+        )
+
+
+def _correlations(findings: Findings, names: Sequence[str]) -> Table:
+    correlation = findings.differences_correlation
+    largest = np.argsort(-np.abs(correlation), axis=1)[:, :2]
+    return Table(
+        "Correlation of the differences with these: the two largest",
+        ("", "with", "rho", "with", "rho"),
+        tuple(
+            (
+                f"r_x - r_{'yz'[row // 3]}, {'XYZ'[row % 3]}",
+                *chain.from_iterable((names[k], f"{correlation[row, k]:+.2f}") for k in largest[row]),
+            )
+            for row in range(6)
+        ),
+    )
+
+
+def _limits(findings: Findings, arms: Arms) -> Iterator[str]:
+    result = findings.result
+    if result.gauge != "given":
+        yield (
+            "Where the three points lie together is not known: rotations between rests see only how they lie "
+            "to each other. The gauge says where the origin of b was put. Another gauge moves compensated "
+            "data by a rigid lever arm and leaves the velocity at rest as it is."
+        )
+        if arms.gauge == "given":
+            yield "Gauge given: where one of the points lies was stated, and is taken as exact."
+    else:
+        yield (
+            "All nine components rest on the pivot's standing still at the origin of b. A pivot that moves "
+            "with the rotation is told as a common shift of the three points."
+        )
+    yield (
+        "The uncertainties hold for what is in the model: noise as found in the rests, and biases, scale "
+        "factors and misalignments as large as the priors say. They do not hold for a body or mount that "
+        "bends, a reference that moves during the rests, or dither in the gyros' increments."
+    )
+    yield (
+        "The arms belong to this unit, and to the calibration that is named above; with another C_ba or "
+        "other scale factors identify again. They were found at the temperatures above; "
+        "nothing is said of others."
+    )
+
+
+def priors_told(priors: Priors) -> Iterator[tuple[str, str]]:
+    """Priors in the units of the field: what, and how much."""
+    yield "accelerometer bias", f"{priors.accelerometer_bias / UG:g} ug"
+    yield "accelerometer scale", f"{priors.accelerometer_scale / PPM:g} ppm"
+    yield "accelerometer misalignment", f"{priors.accelerometer_misalignment / URAD:g} urad"
+    yield "gyro bias", f"{priors.gyro_bias / DEG_PER_H:g} deg/h"
+    yield "gyro scale", f"{priors.gyro_scale / PPM:g} ppm"
+    yield "gyro misalignment", f"{priors.gyro_misalignment / URAD:g} urad"
+
+
+def _names(result: Identification) -> list[str]:
+    """Names of the nuisances in words, runs by their numbers."""
+    runs = {f"phi {run.label}": f"run {k + 1}" for k, run in enumerate(result.runs)}
+    tilts = {"east": "tilt about east", "north": "tilt about north", "up": "heading"}
+    names = []
+    for nuisance in result.nuisances:
+        head, _, part = nuisance.name.rpartition("_")
+        names.append(f"{runs[head]} {tilts[part]}" if head in runs else nuisance.name.replace("_", " "))
+    return names
+
+
+def _nuisance(n: Nuisance, words: str) -> tuple[str, ...]:
+    unit, factor = _unit(n.name)
+    return (words, *(_three(value / factor) for value in (n.value, n.sigma, n.prior)), unit)
+
+
+def _unit(name: str) -> tuple[str, float]:
+    """Unit that a nuisance is told in, and its size."""
+    if name.startswith("accelerometer_bias"):
+        return "ug", UG
+    if name.startswith("gyro_bias"):
+        return "deg/h", DEG_PER_H
+    if name.startswith("skew"):
+        return "ms", 1e-3
+    if name.startswith("quadratic"):
+        return "ug/g^2", UG / STANDARD_GRAVITY**2
+    if name.endswith(("_xx", "_yy", "_zz")):
+        return "ppm", PPM
+    return "urad", URAD
+
+
+def _three(value: float) -> str:
+    """Three digits; whole numbers up to a million whole."""
+    return f"{value:.0f}" if 1000.0 <= abs(value) < 1e6 else f"{value:#.3g}".rstrip(".")
+
+
+def _decimals(sigma_m: Array) -> int:
+    """Places behind the point, mm, that leave two digits of the smallest uncertainty that is not zero."""
+    least = float(sigma_m[sigma_m > 1e-9].min(initial=1.0)) / MM
+    return int(np.clip(1 - floor(log10(least)), 1, 5))
+
+
+def _count(n: int, what: str) -> str:
+    return f"{n} {what}{'' if n == 1 else 's'}"
+
+
+def printable(text: str) -> str:
+    """Text of a file with nothing in it that could steer a terminal."""
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
+
+
+_METHODS: Final = {
+    "joint": "joint estimate of the arms with biases, tilts and misalignments from all rests",
+    "plain": "plain V = H R, one velocity for each rotation",
+}
+
+
+# As text
+
+
+def _text(shown: RenderableType) -> str:
+    out = StringIO()
+    Console(file=out, width=WIDTH, color_system=None).print(shown)
+    return "".join(f"{line.rstrip()}\n" for line in out.getvalue().splitlines())
+
+
+def _shown(block: Block) -> Iterator[RenderableType]:
+    if isinstance(block, Drawing):
+        return
+    if isinstance(block, Paragraph):
+        yield Padding(RichText(block.text), (0, 0, 1, 2))
+    elif isinstance(block, Pairs):
+        grid = RichTable.grid(padding=(0, 2, 0, 0))
+        grid.add_column()
+        grid.add_column(overflow="fold")
+        for name, value in block.rows:
+            grid.add_row(RichText(name, style=_MARKS.get(name, "dim")), RichText(value))
+        yield Padding(grid, (0, 0, 1, 2))
+    else:
+        table = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False)
+        for k, name in enumerate(block.head):
+            table.add_column(RichText(name), justify="right" if k else "left", overflow="fold")
+        for row in block.rows:
+            table.add_row(*map(RichText, row))
+        yield Padding(RichText(block.title), (0, 0, 0, 2))
+        yield Padding(table, (0, 0, 1, 2))
+
+
+_MARKS: Final = {"good": "bold green", "note": "bold", "caution": "bold yellow", "bad": "bold red"}
+
+
+# As HTML
+
+
+def _marked_up(block: Block) -> str:
+    if isinstance(block, Paragraph):
+        return f"<p>{escape(block.text)}</p>\n"
+    if isinstance(block, Drawing):
+        image = b64encode(block.draw()).decode()
+        return (
+            f'<figure><img alt="{escape(block.title)}" src="data:image/svg+xml;base64,{image}">'
+            f"<figcaption>{escape(block.title)}</figcaption></figure>\n"
+        )
+    if isinstance(block, Pairs):
+        rows = "".join(
+            f'<tr><th class="{name if name in _MARKS else "name"}">{escape(name)}</th>'
+            f"<td>{escape(value)}</td></tr>\n"
+            for name, value in block.rows
+        )
+        return f'<table class="pairs">\n{rows}</table>\n'
+    head = "".join(f"<th>{escape(name)}</th>" for name in block.head)
+    rows = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>\n" for row in block.rows)
+    kind = "long" if len(block.rows) > LONG else "short"
+    return (
+        f'<h3>{escape(block.title)}</h3>\n<table class="{kind}">\n<thead><tr>{head}</tr></thead>\n'
+        f"<tbody>\n{rows}</tbody></table>\n"
+    )
+
+
+_STYLE: Final = """
+:root { color-scheme: light; }
+body { font: 15px/1.5 "Helvetica Neue", Arial, "Liberation Sans", sans-serif; color: #22262b;
+       background: #fff; max-width: 54rem; margin: 2.5rem auto; padding: 0 1.5rem; }
+header { border-bottom: 2px solid #1f5fa8; margin-bottom: 1.5rem; }
+h1 { font-size: 1.6rem; font-weight: 600; margin: 0; }
+header p { color: #5b6068; margin: 0.2rem 0 0.8rem; }
+h2 { font-size: 1.1rem; font-weight: 600; margin: 2rem 0 0.6rem; border-bottom: 1px solid #d9dce0; }
+table { border-collapse: collapse; margin: 0.2rem 0 1.2rem; font-size: 0.87rem;
+        font-variant-numeric: tabular-nums; }
+.pairs, .short, tr { break-inside: avoid; }
+h3 { font-size: 0.87rem; font-weight: 600; margin: 1rem 0 0.2rem; break-after: avoid; }
+th, td { padding: 0.15rem 0.75rem; text-align: right; vertical-align: top; }
+th:first-child, td:first-child { text-align: left; padding-left: 0; }
+thead th { border-bottom: 1px solid #8a8f98; font-weight: 500; }
+thead + tbody tr:nth-child(even) { background: #f6f7f9; }
+.pairs td { text-align: left; overflow-wrap: anywhere; }
+.pairs th { text-align: left; font-weight: 500; min-width: 6rem; color: #5b6068; }
+.pairs .good { color: #2c6e3f; } .pairs .caution { color: #9a5b00; } .pairs .bad { color: #b3261e; }
+.pairs .good, .pairs .note, .pairs .caution, .pairs .bad { font-weight: 700; text-transform: uppercase; }
+figure { margin: 0.8rem 0 1.4rem; break-inside: avoid; }
+figure img { width: 100%; height: auto; }
+figcaption { font-size: 0.85rem; color: #5b6068; }
+@media print {
+  body { font-size: 10pt; max-width: none; margin: 0; padding: 0; }
+  h2 { break-after: avoid; }
+  @page { margin: 18mm; }
+}
+"""
+
+_PAGE: Final = """<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta http-equiv="Content-Security-Policy"
+      content="default-src 'none'; img-src data:; style-src 'unsafe-inline'">
+<title>{title}</title>
+<style>{style}</style>
+</head>
+<body>
+<header><h1>{title}</h1><p>{subtitle}</p></header>
+{body}
+</body>
+</html>
+"""

@@ -1,0 +1,387 @@
+import importlib.util
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from calib.identify import DIFFERENCES, SHIFT_FREE, Identification, Noise, Planned, joint, plain, predict
+from calib.runs import Priors, Run, collect
+from calib.segments import Limits
+from imudrv import profiles
+from imudrv.calibration import coefficients, read_calibration
+from imudrv.captures import Capture
+from imudrv.errors import InputError
+from imudrv.imu.compensation import Compensator
+from imudrv.imu.rate_filter import rate_filter
+from imudrv.records import INCREMENTS, Records
+from imudrv.site import Site
+from imudrv.units import DEG, DEG_PER_H, MM, PPM, STANDARD_GRAVITY, UG, URAD
+
+Array = NDArray[np.float64]
+
+THREE = (Planned("+Z", after_s=12.0), Planned("+X", after_s=12.0), Planned("+Y", after_s=12.0))
+BOTH = (*THREE, *(replace(planned, angle_deg=-180.0) for planned in THREE))
+LATITUDE = 28.2 * DEG
+
+
+@pytest.fixture(scope="module")
+def montecarlo() -> ModuleType:
+    """The script of that name."""
+    path = Path(__file__).parents[2] / "tools" / "montecarlo.py"
+    spec = importlib.util.spec_from_file_location("montecarlo", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["montecarlo"] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def simulated(montecarlo: ModuleType) -> tuple[list[Run], Array]:
+    """Six rotations of a unit, and its true arms."""
+    runs, truth = montecarlo.case(5, (1, -1), montecarlo.BUDGETS["standard"])
+    return runs, truth
+
+
+@pytest.fixture(scope="module")
+def captured(reference: Path) -> tuple[list[Run], Array]:
+    """The runs of the reference captures, and the true arms."""
+    calibration = read_calibration(reference / "calibration.yaml")
+    site = Site(**yaml.safe_load((reference / "site.yaml").read_text()))
+    profile = profiles.load("imu50-rs422")
+    known = coefficients(calibration)
+    runs: list[Run] = []
+    for name in ("z_up", "x_up", "y_up"):
+
+        def read(name: str = name) -> Any:
+            capture = Capture(reference / f"{name}.raw", profile)
+            interval_ns = capture.layout.interval_ns
+            compensator = Compensator(known, capture.layout, rate_filter("causal", interval_ns))
+            return capture.increments(compensator, lambda _: None)
+
+        runs += collect(read, known.C_ba, site, label=name).runs
+    r_mm = yaml.safe_load((reference / "truth.yaml").read_text())["r_mm"]
+    return runs, np.array([r_mm[axis] for axis in "xyz"]) * MM
+
+
+def rms_mm(found: Identification, truth: Array) -> float:
+    return float(np.sqrt(((found.R_b - truth) ** 2).mean())) / MM
+
+
+def refused(runs: Sequence[Run], **options: Any) -> str:
+    with pytest.raises(InputError) as caught:
+        joint(runs, **options)
+    return str(caught.value)
+
+
+# --- the reference captures ---
+
+
+def test_joint_finds_the_arms_of_the_reference_captures(captured: tuple[list[Run], Array]) -> None:
+    runs, truth = captured
+    found = joint(runs)
+    assert rms_mm(found, truth) < 0.05  # the requirement; the predicted sigma is 0.012
+    assert found.rank == 6
+    assert found.reason.startswith("rank 6: the directions seen have a sigma of 0.01")
+    assert found.direction_sigma[5] < 0.03 * MM
+    assert found.direction_sigma[6] > 1.0
+    error = found.differences.ravel() - DIFFERENCES @ truth.ravel()
+    assert error @ np.linalg.solve(found.differences_covariance, error) < chi2.ppf(0.999, 6)
+    # 246 degrees of freedom, and noise known to some 10 %
+    assert 0.7 < found.chi_square / found.degrees_of_freedom < 1.4
+    assert found.consistent
+
+
+def test_plain_finds_them_as_the_literature_does(captured: tuple[list[Run], Array]) -> None:
+    runs, truth = captured
+    found = plain(runs)
+    assert rms_mm(found, truth) < 0.6  # the requirement
+    assert found.rank == 6
+    error = found.differences.ravel() - DIFFERENCES @ truth.ravel()
+    assert error @ np.linalg.solve(found.differences_covariance, error) < chi2.ppf(0.999, 6)
+    # six equations for six unknowns: nothing is left over
+    assert found.degrees_of_freedom == 0
+    assert found.consistent
+
+
+def test_compensation_takes_nearly_all_of_the_velocity(captured: tuple[list[Run], Array]) -> None:
+    for run in joint(captured[0]).runs:
+        # left is what bias and misalignment do in 3 s
+        assert np.hypot(*run.compensated_n[:2]) < 0.05 * np.hypot(*run.V_n[:2])
+        # what the estimate says of the velocity fits it within noise, a random walk over 25 s
+        assert np.abs(run.v_n - run.fitted_n).max() < 1e-3
+        assert len(run.t_s) == len(run.v_n) == len(run.fitted_n)
+    assert [run.axis for run in joint(captured[0]).runs] == ["+Z", "+X", "+Y"]
+
+
+# --- what the rotations see ---
+
+
+def test_a_common_shift_is_the_only_thing_that_six_rotations_do_not_see(
+    simulated: tuple[list[Run], Array],
+) -> None:
+    runs, truth = simulated
+    for found in (joint(runs), plain(runs)):
+        assert found.rank == 6
+        assert found.gauge == "centroid"
+        np.testing.assert_allclose(found.R_b.sum(axis=0), 0.0, atol=1e-15)
+        assert np.linalg.matrix_rank(found.covariance, tol=1e-8 * found.covariance.max()) == 6
+        assert found.direction_sigma[6] > 100.0 * found.direction_sigma[5]
+        assert found.singular_values[5] > 1.0
+        assert found.singular_values[6] < 1e-3
+    np.testing.assert_allclose(SHIFT_FREE.T @ np.tile(np.eye(3), (3, 1)), 0.0, atol=1e-15)
+    assert rms_mm(joint(runs), truth) < 0.04  # predicted 0.011
+
+
+def test_nine_components_without_a_known_pivot_are_refused(simulated: tuple[list[Run], Array]) -> None:
+    assert "a common shift of the three sensing points leaves no velocity at rest" in refused(
+        simulated[0], nine=True
+    )
+
+
+def test_rotations_about_too_few_axes_are_refused_with_the_directions_unseen(
+    simulated: tuple[list[Run], Array],
+) -> None:
+    runs = simulated[0]
+    message = refused(runs[:2])
+    assert "expected rotations that see 6 directions of the lever arms, got 4" in message
+    assert "add rotations with another axis up" in message
+    # one axis, both signs: what its lean of 3 mrad shows of a third direction is too little
+    assert "got 2" in refused([runs[0], runs[3]])
+    with pytest.raises(InputError, match="got 4"):
+        plain(runs[:2])
+    assert "expected one good rotation at least, got none" in refused([])
+
+
+def test_without_one_of_three_rotations_there_is_no_result_without_one_of_six_nearly_the_same(
+    simulated: tuple[list[Run], Array],
+) -> None:
+    runs = simulated[0]
+    three, six = joint(runs[:3]), joint(runs)
+    assert [(left.rank, left.shift_m) for left in three.left_out] == [(4, None)] * 3
+    for k, left in enumerate(six.left_out):
+        assert left.rank == 6
+        without = joint([run for j, run in enumerate(runs) if j != k])
+        assert left.shift_m is not None
+        # the noise is pooled over other rests
+        np.testing.assert_allclose(left.shift_m, without.R_b - six.R_b, atol=3e-3 * MM)
+        assert 0.0 < np.abs(left.shift_m).max() < 0.1 * MM
+
+
+def test_the_order_of_the_runs_does_not_matter(simulated: tuple[list[Run], Array]) -> None:
+    runs = simulated[0]
+    a, b = joint(runs), joint(runs[::-1])
+    np.testing.assert_allclose(a.R_b, b.R_b, atol=1e-10)
+    np.testing.assert_allclose(a.covariance, b.covariance, atol=1e-15)
+    assert a.chi_square == pytest.approx(b.chi_square, rel=1e-6)
+
+
+def test_correlations_are_correlations(simulated: tuple[list[Run], Array]) -> None:
+    found = joint(simulated[0])
+    assert found.correlation.shape == (9, len(found.nuisances))
+    assert np.abs(found.correlation).max() <= 1.0 + 1e-9
+    assert np.abs(found.correlation).max() > 0.01
+    by_name = {n.name: n for n in found.nuisances}
+    assert by_name["accelerometer_bias_x"].prior == Priors().accelerometer_bias
+    assert all(n.sigma <= n.prior * (1.0 + 1e-9) for n in found.nuisances)
+
+
+# --- accuracy, and whether it is what is said ---
+
+
+@pytest.mark.parametrize(("signs", "limit_mm"), [((1,), 0.03), ((1, -1), 0.015)])
+def test_many_units_are_found_as_well_as_predicted(
+    montecarlo: ModuleType, signs: tuple[int, ...], limit_mm: float
+) -> None:
+    cases = 12 if len(signs) == 1 else 8
+    of_joint, of_plain = montecarlo.montecarlo(range(100, 100 + cases), signs, montecarlo.BUDGETS["standard"])
+    assert of_joint.mean_rms_mm < limit_mm  # the requirement
+    assert of_plain.mean_rms_mm > 5.0 * of_joint.mean_rms_mm
+    for found in (of_joint, of_plain):
+        # six degrees of freedom a case; once in 500
+        low, high = chi2.ppf([0.001, 0.999], 6 * cases) / cases
+        assert low < found.nees < high
+        # a scatter from 6 * cases independent numbers: 1 / sqrt(12 cases) = 8 to 10 %, three times
+        assert found.ratio == pytest.approx(1.0, abs=0.31)
+    # 500 degrees of freedom a case: what is left is how well each case tells its noise, some 10 % in sigma
+    assert of_joint.chi_square_per_degree == pytest.approx(1.0, abs=0.2)
+    if len(signs) == 2:  # six equations are over, mean square 1, their mean sqrt(2 / 6 cases); three times
+        assert of_plain.chi_square_per_degree == pytest.approx(1.0, abs=0.62)
+
+
+@pytest.mark.parametrize("budget", ["bias", "misalignment", "slow", "tilted", "offset", "arw"])
+def test_a_harder_budget_widens_the_prediction_with_the_error(montecarlo: ModuleType, budget: str) -> None:
+    cases = 4
+    found, _ = montecarlo.montecarlo(range(200, 200 + cases), (1,), montecarlo.BUDGETS[budget])
+    low, high = chi2.ppf([0.0005, 0.9995], 6 * cases) / cases
+    assert low < found.nees < high
+    least_mm = {"slow": 0.025, "arw": 0.017}.get(budget, 0.012)  # standard: 0.016
+    assert found.predicted_mm > least_mm
+
+
+# --- before any data ---
+
+
+def test_a_plan_predicts_what_the_data_then_give(simulated: tuple[list[Run], Array]) -> None:
+    found = joint(simulated[0])
+    predicted = predict(BOTH, LATITUDE, found.noise)
+    # the plan knows neither tilts nor how well the heading was aligned
+    np.testing.assert_allclose(predicted.differences_sigma, found.differences_sigma, rtol=0.1)
+    np.testing.assert_allclose(predicted.covariance, found.covariance, atol=0.1 * found.covariance.max())
+
+
+def test_slower_rotations_and_fewer_predict_more() -> None:
+    noise = Noise(6e-7, 5e-5, 5e-6, 1.4e-4)
+    three = predict(THREE, LATITUDE, noise).differences_sigma
+    assert (predict(BOTH, LATITUDE, noise).differences_sigma < 0.8 * three).all()
+    slow = predict([replace(planned, duration_s=4.0) for planned in THREE], LATITUDE, noise)
+    # velocity a metre falls as 1 / T, what drifts meanwhile grows
+    assert (slow.differences_sigma > 1.6 * three).all()
+    other_way_up = predict([replace(planned, up=f"-{planned.up[1]}") for planned in THREE], LATITUDE, noise)
+    np.testing.assert_allclose(np.sort(other_way_up.differences_sigma, None), np.sort(three, None), rtol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("plan", "message"),
+    [
+        ([], "expected one rotation at least, got none"),
+        (
+            THREE[:2],
+            "expected rotations that see 6 directions of the lever arms, got 4; not seen to 3 mm: .*_",
+        ),
+        ((THREE[0],) * 3, "got 2; not seen"),
+        ((replace(THREE[0], up="up"),), r"expected an axis up from \+X to -Z"),
+        ((replace(THREE[0], after_s=0.1),), "a rest of 0.5 s at least"),
+    ],
+)
+def test_a_plan_that_cannot_do_is_refused(plan: Sequence[Planned], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        predict(plan, LATITUDE, Noise(6e-7, 5e-5, 5e-6, 1.4e-4))
+
+
+def test_the_direction_that_a_plan_does_not_see_is_named() -> None:
+    # with Y never up, how z_X and x_Z lie to the others turns no level velocity out of its direction
+    with pytest.raises(InputError) as caught:
+        predict((THREE[0], THREE[1]), LATITUDE, Noise(6e-7, 5e-5, 5e-6, 1.4e-4))
+    told = str(caught.value)
+    assert "x_Z" in told
+    assert "z_X" in told
+    assert "Y" not in told.split("not seen")[1].split("add")[0]  # what lies along Y is seen
+
+
+# --- a known pivot, and more unknowns ---
+
+
+@pytest.fixture(scope="module")
+def turntable(montecarlo: ModuleType) -> Callable[..., tuple[list[Run], Array]]:
+    """Three rotations whose fixed point lies so far from the origin of b, and the true arms."""
+
+    def make(pivot_mm: float, seed: int = 3) -> tuple[list[Run], Array]:
+        runs, truth = montecarlo.case(seed, (1,), replace(montecarlo.BUDGETS["standard"], pivot_mm=pivot_mm))
+        return runs, truth
+
+    return make
+
+
+def test_a_known_pivot_makes_all_nine_observable(turntable: Callable[..., tuple[list[Run], Array]]) -> None:
+    runs, truth = turntable(0.0)
+    found = joint(runs, pivot="fixed", nine=True)
+    assert found.rank == 9
+    assert found.gauge == "given"
+    error = (found.R_b - truth).ravel()
+    assert error @ np.linalg.solve(found.covariance, error) < chi2.ppf(0.999, 9)
+    assert found.sigma.max() < 0.05 * MM
+    assert found.consistent
+
+
+@pytest.mark.parametrize("pivot_mm", [0.3, 1.0, 10.0, 100.0])
+def test_a_pivot_that_did_not_stay_still_is_refused(
+    turntable: Callable[..., tuple[list[Run], Array]], pivot_mm: float
+) -> None:
+    message = refused(turntable(pivot_mm)[0], pivot="fixed")
+    assert "expected the origin of b to stay still, but the velocities contradict it: chi-square" in message
+
+
+def test_what_the_data_cannot_tell_is_said(simulated: tuple[list[Run], Array]) -> None:
+    found = joint(simulated[0], extra=("quadratic",))
+    # a quadratic term is a bias where one axis is always up
+    assert len(found.notes) == 3
+    assert found.notes[0].startswith("quadratic_x not observable in these runs: sigma ")
+    assert found.notes[0].endswith(" ug/g^2")
+    # and what cannot be told does no harm
+    np.testing.assert_allclose(found.R_b, joint(simulated[0]).R_b, atol=1e-3 * MM)
+    assert joint(simulated[0]).notes == ()
+
+
+def test_a_skew_is_seen_with_a_known_pivot(montecarlo: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    scenario = montecarlo.scenario
+
+    def skewed(*arguments: Any) -> Any:
+        made = scenario(*arguments)
+        return made.model_copy(update={"unit": made.unit.model_copy(update={"accelerometer_skew_s": 3e-3})})
+
+    monkeypatch.setattr(montecarlo, "scenario", skewed)
+    runs, truth = montecarlo.case(3, (1,), replace(montecarlo.BUDGETS["standard"], pivot_mm=0.0))
+    found = joint(runs, pivot="fixed", extra=("skew",))
+    skew = next(n for n in found.nuisances if n.name == "skew_s")
+    assert skew.seen
+    assert skew.value == pytest.approx(3e-3, abs=4.0 * skew.sigma)
+    assert skew.sigma < 0.6e-3
+    error = (found.R_b - truth).ravel()
+    assert error @ np.linalg.solve(found.covariance, error) < chi2.ppf(0.999, 9)
+
+
+# --- golden: 19 positions of a turntable, every error injected, without noise ---
+
+
+@pytest.fixture(scope="module")
+def positions(data: Path) -> Records:
+    rows = np.fromfile(data / "imusysclbt.bin", "<f4").reshape(-1, 7).astype(np.float64)
+    out = np.zeros(len(rows), INCREMENTS)
+    out["counter"] = np.arange(len(rows))
+    out["interval_ns"], out["flags"] = 10_000_000, 1
+    out["t_ns"] = (out["counter"] + 1) * 10_000_000
+    out["dtheta_b"], out["dv_b"] = rows[:, :3], rows[:, 3:6]
+    return out
+
+
+def test_a_turntable_run_gives_all_nine_with_every_other_error(positions: Records) -> None:
+    # its errors are ten times the budget of a calibrated unit
+    priors = Priors(
+        accelerometer_bias=100.0 * UG,
+        accelerometer_scale=100.0 * PPM,
+        accelerometer_misalignment=300.0 * URAD,
+        gyro_bias=0.3 * DEG_PER_H,
+        gyro_scale=100.0 * PPM,
+        gyro_misalignment=500.0 * URAD,
+    )
+    # quarter turns about level axes, 10 deg/s
+    limits = Limits(angle_tolerance_deg=np.inf, least_peak_deg_per_s=0.0, axis_tilt_deg=90.0)
+    site = Site(latitude_deg=34.0, longitude_deg=0.0, height_m=0.0)
+    runs = collect(lambda: [positions], np.eye(3), site, limits=limits, priors=priors).runs
+    assert len(runs) == 18
+    found = joint(runs, priors, pivot="fixed", nine=True, extra=("skew", "quadratic"))
+    truth = -np.array([[10.0, 20.0, 30.0], [40.0, 50.0, 60.0], [0.0, 0.0, 0.0]]) * MM
+    assert found.rank == 9
+    assert found.notes == ()
+    assert np.abs(found.R_b - truth).max() < 0.2 * MM  # the requirement; 0.05 found
+    value = {n.name: n.value for n in found.nuisances}
+    # The data were made by a calibration of (10, 20, 30) applied to perfect data: errors are its negative.
+    # Its gyro-accelerometer delay is what is called skew here.
+    assert value["skew_s"] == pytest.approx(1e-3, abs=0.02e-3)  # the requirement
+    for axis, expected in zip("xyz", (-10.0, -20.0, -30.0), strict=True):
+        quadratic = value[f"quadratic_{axis}"] * STANDARD_GRAVITY**2 / UG
+        assert quadratic == pytest.approx(expected, abs=2.0)  # the requirement, ug/g^2
+        assert value[f"accelerometer_bias_{axis}"] / UG == pytest.approx(expected, abs=2.0)
+        assert value[f"gyro_bias_{axis}"] / DEG_PER_H == pytest.approx(expected / 100.0, abs=0.01)
+        assert value[f"accelerometer_matrix_{axis}{axis}"] / PPM == pytest.approx(expected, abs=2.0)
+        assert value[f"gyro_matrix_{axis}{axis}"] / PPM == pytest.approx(expected, abs=2.0)

@@ -1,0 +1,180 @@
+"""The report: whole, self-contained, safe, and the same as text."""
+
+import re
+from base64 import b64decode
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.cells import cell_len
+
+from calib.findings import Basis, Findings, find
+from calib.gauge import Arms, convert
+from calib.identify import LeftOut
+from calib.report import arms_text, report_html, report_text, verdict
+from imudrv import profiles
+from imudrv.cli import main as imudrv
+from imudrv.sim.scenario import NOMINAL
+from imudrv.site import Site
+from imudrv.units import MM
+
+HOSTILE = "<img src=x onerror=alert(1)>&\x1b[31m$\\frac{长名字}$" + 60 * "z"
+SCENARIO = """
+format: imu50-scenario
+version: 1
+seed: 11
+site: {{latitude_deg: 28.2, longitude_deg: 113.0, height_m: 60.0}}
+start: {{pose: {pose}}}
+motion:
+  - rest: {{duration_s: 40}}
+  - rotate: {{angle_deg: 180, duration_s: 2.5}}
+  - rest: {{duration_s: 6}}
+  - rotate: {{angle_deg: 30, duration_s: 2.0}}
+  - rest: {{duration_s: 2}}
+unit:
+  noise: {{arw_deg_per_sqrt_h: 0.002, vrw_m_s_per_sqrt_h: 0.003}}
+"""
+
+
+@pytest.fixture(scope="module")
+def findings(tmp_path_factory: pytest.TempPathFactory) -> Findings:
+    """Three poses, a hostile file name, a unit whose number is markup; a second, small turn in each."""
+    folder = tmp_path_factory.mktemp("report")
+    captures = []
+    for name, pose in ((HOSTILE, "z_up"), ("x", "x_up"), ("y", "y_up")):
+        (folder / "run.yaml").write_text(SCENARIO.format(pose=pose))
+        captures.append(folder / f"{name}.raw")
+        out = ["-o", str(captures[-1])]
+        assert imudrv(["sim", str(folder / "run.yaml"), "--profile", "imu50-rs422", *out]) == 0
+    unit = NOMINAL.model_copy(update={"serial_number": "50<b>&17"})
+    site = Site(latitude_deg=28.2, longitude_deg=113.0, height_m=60.0)
+    return find(captures, profiles.load("imu50-rs422"), Basis(unit, "<u>.yaml", "0f" * 32), site)
+
+
+@pytest.fixture(scope="module")
+def arms(findings: Findings) -> tuple[Arms, Arms]:
+    return findings.arms, convert(findings.arms, "x")
+
+
+@pytest.fixture(scope="module")
+def page(findings: Findings, arms: tuple[Arms, Arms]) -> str:
+    return report_html(findings, arms)
+
+
+class Tags(HTMLParser):
+    """Every tag with its attributes; and whether they nest."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.found: list[tuple[str, dict[str, str | None]]] = []
+        self.open: list[str] = []
+        self.feed(page)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found.append((tag, dict(attrs)))
+        if tag not in ("meta", "img"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+def test_the_page_loads_nothing_and_runs_nothing(page: str) -> None:
+    tags = Tags(page)
+    assert tags.open == []
+    assert {tag for tag, _ in tags.found}.isdisjoint(
+        {"script", "link", "iframe", "object", "embed", "form", "b", "u"}
+    )
+    for _, attributes in tags.found:
+        assert not [
+            name for name in attributes if name.startswith("on") or name in ("href", "srcset", "style")
+        ]
+        assert attributes.get("src", "data:image/svg+xml;base64,").startswith("data:image/svg+xml;base64,")
+    assert not re.search(r"https?://|@import|url\(", page)
+    assert len(page) < 1_500_000
+
+
+def test_its_figures_are_whole_drawings_that_load_nothing_either(page: str) -> None:
+    images = re.findall(r'src="data:image/svg\+xml;base64,([^"]+)"', page)
+    assert len(images) == 1 + 3 + 1 + 1  # points, a run each, before and after, directions
+    for image in images:
+        drawing = b64decode(image).decode()
+        assert drawing.rstrip().endswith("</svg>")
+        assert "<script" not in drawing
+        assert not re.search(r'(?:href|src)="(?!#)', drawing)
+
+
+def test_what_comes_from_files_is_escaped(page: str, findings: Findings, arms: tuple[Arms, Arms]) -> None:
+    assert "<img src=x" not in page
+    assert "&lt;img src=x onerror=alert(1)&gt;&amp;" in page
+    assert "50&lt;b&gt;&amp;17" in page
+    assert "\x1b" not in page
+    assert "\x1b" not in report_text(findings, arms)
+
+
+def test_the_text_fits_80_columns_whatever_the_names(findings: Findings, arms: tuple[Arms, Arms]) -> None:
+    text = report_text(findings, arms)
+    assert max(map(cell_len, text.splitlines())) <= 80
+    assert not re.search(r"[ \t]$", text, re.MULTILINE)
+    assert 60 * "z" in re.sub(r"\s", "", text)  # folded, not cut
+
+
+def test_a_report_is_a_function_of_the_findings(
+    page: str, findings: Findings, arms: tuple[Arms, Arms]
+) -> None:
+    assert report_html(findings, arms) == page
+
+
+def test_text_and_page_tell_the_same_numbers(page: str, findings: Findings, arms: tuple[Arms, Arms]) -> None:
+    numbers = re.compile(r"[+-]\d+\.\d+")
+    body = re.sub(r'src="[^"]*"|<style>.*</style>', "", page, flags=re.DOTALL)
+    assert set(numbers.findall(report_text(findings, arms))) == set(numbers.findall(body))
+
+
+def test_nine_numbers_never_stand_without_their_gauge(findings: Findings, arms: tuple[Arms, Arms]) -> None:
+    text = report_text(findings, arms)
+    heads = [line for line in text.splitlines() if line.startswith("  Sensing points in body axes")]
+    assert heads == [f"  Sensing points in body axes, mm, gauge {gauge}" for gauge in ("centroid", "x")]
+    assert len(re.findall(r"^  r_x  ", text, re.MULTILINE)) == 2
+    assert "gauge x" in arms_text(arms[1])
+    assert "gauge x" in arms_text(Arms(arms[1].r_b, None, "x"))
+
+
+def test_every_rotation_is_told_with_verdict_or_reason(findings: Findings, arms: tuple[Arms, Arms]) -> None:
+    text = " ".join(report_text(findings, arms).split())
+    assert text.count("serves: within all limits") == 3
+    assert text.count("turned 30.0 deg, want 180 +- 5") == 3
+
+
+def test_the_verdict_is_bad_where_the_data_contradict_the_model(findings: Findings) -> None:
+    n = findings.result.degrees_of_freedom
+    marks = {}
+    for ratio in (0.5, 1.0, 1.5, 3.0):
+        result = replace(findings.result, chi_square=ratio * n)
+        marks[ratio] = list(verdict(replace(findings, result=result)))[1]
+    assert [marks[ratio][0] for ratio in marks] == ["caution", "good", "caution", "bad"]
+    assert "by a factor of 1.22" in marks[1.5][1]
+    assert "No certificate rests on them" in marks[3.0][1]
+
+
+def test_a_rotation_that_could_be_left_out_is_told_with_its_change(findings: Findings) -> None:
+    shift = np.zeros((3, 3))
+    shift[1, 2] = -0.02 * MM
+    result = replace(findings.result, left_out=(LeftOut("z#1", 6, shift), LeftOut("x#1", 4, None)))
+    told = dict(verdict(replace(findings, result=result)))
+    assert told["note"] == "Leaving out one rotation changes no component by more than 0.020 mm (z#1)."
+
+
+def test_digits_follow_the_uncertainty(findings: Findings) -> None:
+    r_b = np.full((3, 3), 1.23456789 * MM)
+    coarse = arms_text(Arms(r_b, np.diag(np.full(9, (0.25 * MM) ** 2)), "given"))
+    fine = arms_text(Arms(r_b, np.diag(np.full(9, (0.0123 * MM) ** 2)), "given"))
+    assert "+1.23  +1.23  +1.23  0.25" in coarse
+    assert "+1.235  +1.235  +1.235  0.012" in fine
+
+
+def test_the_report_names_files_by_name_only(page: str, tmp_path: Path) -> None:
+    assert str(tmp_path.parent) not in page

@@ -1,0 +1,216 @@
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from calib.segments import Limits, Rotation, Segments, expected_error_mm, find_segments, judge
+from imudrv.errors import InputError
+from imudrv.records import Flag, Records
+
+Bench = Callable[..., Records]
+Step = Callable[..., Any]
+LIMITS = Limits()
+
+
+def only(segments: Segments) -> Rotation:
+    (rotation,) = segments.rotations
+    return rotation
+
+
+@pytest.mark.parametrize("up", ["+Z", "+X", "+Y", "-Z"])
+@pytest.mark.parametrize("angle", [180.0, -180.0])
+def test_a_half_turn_is_found_with_its_angle_sign_and_axis(
+    bench: Bench, step: Step, up: str, angle: float
+) -> None:
+    found = find_segments([bench(step(40.0), step(2.5, angle), step(8.0), up=up)])
+    rotation = only(found)
+    assert judge(rotation, LIMITS) == ()
+    # blocks of 20 ms; the quintic's very ends are slower than the noise
+    assert rotation.start_s == pytest.approx(40.0, abs=0.06)
+    assert rotation.stop_s == pytest.approx(42.5, abs=0.06)
+    # the 2 mrad that the body leans change nothing; the slow ends hide thousandths of a degree
+    assert rotation.angle_deg == pytest.approx(angle, abs=0.01)
+    assert (rotation.axis, rotation.about) == (up, up[1])
+    assert rotation.axis_tilt_deg < 0.2  # of 2.2 mrad
+    assert rotation.peak_deg_per_s == pytest.approx(180.0 * 1.875 / 2.5, rel=0.01)
+    assert [rest.up for rest in found.rests] == [up, up]
+    assert rotation.before is found.rests[0]
+    assert rotation.after is found.rests[1]
+
+
+@pytest.mark.parametrize("pieces", [2, 7, 1000])
+def test_any_cut_into_pieces_finds_the_same(bench: Bench, step: Step, pieces: int) -> None:
+    data = bench(step(20.0), step(2.5, 180.0), step(12.0))
+    whole, cut = find_segments([data]), find_segments(np.array_split(data, pieces))
+    # sums are made piece by piece: rounding
+    assert cut.rotations[0].angle_deg == pytest.approx(whole.rotations[0].angle_deg, abs=1e-9)
+    for a, b in zip(whole.rests, cut.rests, strict=True):
+        assert (a.start, a.stop) == (b.start, b.stop)
+        assert a.noise is not None
+        assert b.noise is not None
+        np.testing.assert_allclose([*vars(a.noise).values()], [*vars(b.noise).values()], rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("steps", "reason"),
+    [
+        ([(40.0,), (2.5, 171.2), (8.0,)], "turned 171.2 deg, want 180 +- 5"),
+        ([(40.0,), (7.0, 180.0), (8.0,)], "peak 48 deg/s: slower than 70, expect 3.2 mm"),
+        (
+            [(40.0,), (2.5, 180.0, (0.3, 0.0, 1.0)), (8.0,)],
+            "axis 16.7 deg off the vertical, want 10 at most",
+        ),
+        ([(20.0,), (2.5, 180.0), (8.0,)], "rest before 20.0 s, want 32"),
+        ([(40.0,), (2.5, 180.0), (3.0,)], "rest after 3.0 s, want 5"),
+        ([(2.5, 180.0), (8.0,)], "no rest before it, want 32 s"),
+        ([(40.0,), (2.5, 180.0)], "no rest after it, want 5 s"),
+    ],
+)
+def test_each_rejection_has_its_number_and_its_limit(
+    bench: Bench, step: Step, steps: list[tuple[Any, ...]], reason: str
+) -> None:
+    rotation = only(find_segments([bench(*(step(*s) for s in steps))]))
+    assert reason in judge(rotation, LIMITS)
+
+
+def test_another_axis_than_the_procedure_wants_is_told(bench: Bench, step: Step) -> None:
+    rotation = only(find_segments([bench(step(40.0), step(2.5, 180.0), step(8.0), up="+Y")]))
+    assert judge(rotation, LIMITS, expected="Y") == ()
+    assert judge(rotation, LIMITS, expected="Z") == ("about Y, expected Z",)
+
+
+def test_missing_samples_and_flags_in_the_rotation_are_told(bench: Bench, step: Step) -> None:
+    data = bench(step(40.0), step(2.5, 180.0), step(8.0))
+    turning = 41 * 500
+    kept = np.delete(data, [turning, turning + 40, turning + 41])
+    kept["flags"][turning + 5] |= Flag.SATURATED
+    kept["flags"][turning + 6] |= Flag.FAULT
+    assert judge(only(find_segments([kept])), LIMITS) == (
+        "3 samples missing during the rotation, want 0 at most",
+        "an axis saturated during the rotation",
+        "the unit told a fault during the rotation",
+    )
+
+
+def test_a_sample_that_bridges_a_gap_leaves_nothing_missing(bench: Bench, step: Step) -> None:
+    data = bench(step(40.0), step(2.5, 180.0), step(8.0))
+    at = 41 * 500
+    for name in ("interval_ns", "dtheta_b", "dv_b"):
+        data[name][at + 1] += data[name][at]
+    assert judge(only(find_segments([np.delete(data, at)])), LIMITS) == ()
+
+
+def test_a_bump_ends_a_rest_and_is_no_rotation(bench: Bench, step: Step) -> None:
+    bumped = bench(
+        step(20.0),
+        step(0.1, 0.2, (1, 0, 0)),
+        step(0.1, -0.2, (1, 0, 0)),
+        step(25.0),
+        step(2.5, 180.0),
+        step(8.0),
+    )
+    bump, rotation = find_segments([bumped]).rotations
+    assert "turned 0.0 deg, want 180 +- 5" in judge(bump, LIMITS)
+    assert judge(rotation, LIMITS) == ("rest before 25.0 s, want 32",)
+
+
+def test_a_shift_that_gyros_do_not_feel_ends_a_rest_too(bench: Bench, step: Step) -> None:
+    data = bench(step(40.0))
+    data["dv_b"][20 * 500 : 20 * 500 + 50, 0] += 0.1 * 0.002  # 10 mg sideways for 0.1 s
+    found = find_segments([data])
+    assert len(found.rests) == 2
+    assert only(found).start_s == pytest.approx(20.0, abs=0.05)
+
+
+def test_two_pushes_with_a_short_pause_are_one_rotation(bench: Bench, step: Step) -> None:
+    data = bench(step(40.0), step(1.3, 90.0), step(0.5), step(1.3, 90.0), step(8.0))
+    assert judge(only(find_segments([data])), LIMITS) == ()
+
+
+def test_two_pushes_with_a_rest_between_are_two_that_do_not_serve(bench: Bench, step: Step) -> None:
+    data = bench(step(40.0), step(1.3, 90.0), step(3.0), step(1.3, 90.0), step(8.0))
+    first, second = (judge(r, LIMITS) for r in find_segments([data]).rotations)
+    assert first == ("turned 90.0 deg, want 180 +- 5", "rest after 3.0 s, want 5")
+    assert second == ("turned 90.0 deg, want 180 +- 5", "rest before 3.0 s, want 32")
+
+
+def test_placing_the_unit_between_rotations_is_no_rotation(bench: Bench, step: Step) -> None:
+    # Z up, then slowly about north to have X up, with a wobble, then the next half turn
+    data = bench(
+        step(40.0),
+        step(2.5, 180.0),
+        step(8.0),
+        step(6.0, 90.0, (0, 1, 0)),
+        step(2.0, 15.0, (0, 0, 1)),
+        step(40.0),
+        step(2.5, 180.0),
+        step(8.0),
+    )
+    found = find_segments([data])
+    first, placing, second = found.rotations
+    assert judge(first, LIMITS) == ()
+    assert judge(second, LIMITS) == ()
+    reasons = judge(placing, LIMITS)
+    assert any("off the vertical" in reason for reason in reasons)
+    assert placing.about == "Y"
+    assert found.rests[1].up == "+Z"
+    assert found.rests[2].up in ("+X", "-X")
+    assert first.after is found.rests[1]  # the placing ends it
+
+
+def test_a_capture_that_begins_in_motion_still_gives_its_rotation(bench: Bench, step: Step) -> None:
+    data = bench(
+        step(3.0, 40.0, (1, 1, 0)), step(3.0, -40.0, (1, 1, 0)), step(40.0), step(2.5, -180.0), step(8.0)
+    )
+    moving, rotation = find_segments([data]).rotations
+    assert moving.before is None
+    assert judge(rotation, LIMITS) == ()
+
+
+def test_a_long_gap_is_no_rest(bench: Bench, step: Step) -> None:
+    data = bench(step(40.0))
+    assert len(find_segments([np.delete(data, slice(10_000, 10_003))]).rests) == 1  # 6 ms
+    holed = find_segments([np.delete(data, slice(10_000, 10_500))])
+    assert len(holed.rests) == 2
+    assert only(holed).missing == 500
+
+
+def test_a_leap_of_the_counter_costs_no_memory(bench: Bench, step: Step) -> None:
+    data = bench(step(20.0))
+    data["counter"][5000:] += 2**40
+    assert len(find_segments([data]).rests) == 2
+
+
+@pytest.mark.parametrize("times", [0.0, 1.0, 20.0])
+def test_the_noise_floor_is_the_datas_own(bench: Bench, step: Step, times: float) -> None:
+    data = bench(step(40.0), step(2.5, 180.0), step(8.0), arw=times * 6e-7, vrw=times * 5e-5)
+    assert judge(only(find_segments([data])), LIMITS) == ()
+
+
+def test_noise_is_found_in_the_rests(bench: Bench, step: Step) -> None:
+    (rest,) = find_segments([bench(step(370.0))]).rests
+    assert rest.noise is not None
+    # 370 s have some 700 independent differences a lag and axis: 4 % for three axes and several lags
+    assert rest.noise.angle_walk == pytest.approx(6e-7, rel=0.12)
+    assert rest.noise.velocity_walk == pytest.approx(5e-5, rel=0.12)
+    (short,) = find_segments([bench(step(5.0))]).rests
+    assert short.noise is None
+
+
+def test_the_slower_the_rotation_the_larger_the_expected_error() -> None:
+    # twice the time halves the velocity a metre and doubles what errors gain
+    assert expected_error_mm(35.0) == pytest.approx(4.0 * expected_error_mm(70.0))
+
+
+def test_too_little_data_are_refused(bench: Bench, step: Step) -> None:
+    with pytest.raises(InputError, match=r"expected a capture of 2 s at least, got 1\.0 s"):
+        find_segments([bench(step(1.0))])
+    with pytest.raises(InputError, match=r"got 0\.0 s"):
+        find_segments([])
+
+
+def test_limits_can_be_others(bench: Bench, step: Step) -> None:
+    rotation = only(find_segments([bench(step(20.0), step(1.5, 90.0), step(8.0))]))
+    assert judge(rotation, replace(LIMITS, angle_deg=90.0, rest_before_s=15.0)) == ()
