@@ -4,6 +4,7 @@ import argparse
 import re
 from collections.abc import Callable, Sequence
 from hashlib import sha256
+from math import inf, nan
 from pathlib import Path
 from typing import Any, Final, Literal, TypeAlias, get_args
 
@@ -11,6 +12,8 @@ import yaml
 from pydantic import ConfigDict, JsonValue
 from rich.console import Console
 
+from calib import procedure as procedures
+from calib.bench import run
 from calib.certificate import (
     CHANGED,
     FOUND,
@@ -22,19 +25,22 @@ from calib.certificate import (
     write,
     write_json,
 )
+from calib.dither import dither_text
 from calib.findings import Basis, find
 from calib.gauge import GAUGES, Arms, Gauge, convert, from_kalibr, from_psins, to_kalibr, to_psins
 from calib.identify import Extra
 from calib.report import arms_text, report_for_terminal, report_html, report_text
+from calib.session import verify
 from imudrv import config, profiles
 from imudrv.calibration import Calibration, read_calibration
 from imudrv.config import Model
-from imudrv.console import guarded, progress
+from imudrv.console import BAD_INPUT, OK, guarded, progress
 from imudrv.errors import InputError
+from imudrv.imu.rate_filter import NAMES, rate_filter
 from imudrv.recording import Recording
 from imudrv.sinks.files import replacing
 from imudrv.site import Site
-from imudrv.units import MM
+from imudrv.units import MM, NS, NS_PER_S
 
 Command: TypeAlias = Callable[[argparse.Namespace], int | None]
 Stated: TypeAlias = tuple[Literal["x", "y", "z"], list[float]]
@@ -113,6 +119,24 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--json", type=Path, metavar="R.json", help="the whole result, for programs")
     sub.add_argument("--report", type=Path, metavar="R.html", help="the report with figures, one file")
 
+    sub = add("run", _run, "Walk through the bench procedure with a unit, to its certificate.")
+    sub.add_argument("--port", metavar="URL", help="where the unit is, as for imudrv run")
+    sub.add_argument("--profile", metavar="P", help="what it sends, as for imudrv run")
+    sub.add_argument(
+        "--calibration", type=Path, metavar="C.yaml", help="its certificate; new once you accept"
+    )
+    sub.add_argument("--site", type=Path, metavar="S.yaml", help="where it stands")
+    sub.add_argument("--procedure", metavar="P", help=f"{', '.join(procedures.shipped())}, or a file")
+    sub.add_argument(
+        "--session", type=Path, metavar="DIR", help="journal and evidence; one that is there is resumed"
+    )
+    sub.add_argument("--hands-free", action="store_true", help="go on by the sensors alone")
+    sub.add_argument("--rehearse", action="store_true", help="with a simulated unit and technician")
+    sub.add_argument("--speed", default="1", metavar="X", help="of the rehearsal: 1, 10, ... or max")
+
+    sub = add("verify", _verify, "Check a session's evidence, and find its result again from the recordings.")
+    sub.add_argument("session", type=Path, metavar="DIR")
+
     sub = add("gauge", _gauge, "A certificate's lever arms in another gauge, exactly, with their covariance.")
     sub.add_argument("file", type=Path, help="the certificate")
     add_gauge(sub, "--to", required=True)
@@ -131,7 +155,50 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--from", dest="program", choices=PROGRAMS, required=True, help="who wrote it")
     sub.add_argument("--calibration", type=Path, required=True, metavar="C.yaml", help="the unit's")
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="NEW.yaml")
+
+    sub = add("dither", _dither, "What dithering gyros do to accelerometers, and what rate filters pass.")
+    sub.add_argument(
+        "--amplitude-arcsec",
+        type=_one_or_three,
+        required=True,
+        metavar="A[,A,A]",
+        help="of the blocks x, y, z, such as 150; 150,0,0 for one gyro",
+    )
+    sub.add_argument(
+        "--frequency-hz", type=_one_or_three, required=True, metavar="F[,F,F]", help="such as 400,405,393"
+    )
+    sub.add_argument("--certificate", type=Path, required=True, metavar="C.yaml", help="with lever arms")
+    sub.add_argument("--rate-hz", type=_positive, default=1000.0, metavar="HZ", help="default: 1000")
+    sub.add_argument("--rate-filter", choices=NAMES, help="default: all of them")
+    sub.add_argument(
+        "--case-reaction",
+        type=_positive,
+        default=0.01,
+        metavar="PART",
+        help="the case's angle over the block's; default: 0.01",
+    )
     return parser
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    return run(
+        port=arguments.port,
+        profile=arguments.profile,
+        calibration=arguments.calibration,
+        site=arguments.site,
+        procedure=arguments.procedure,
+        folder=arguments.session,
+        hands_free=arguments.hands_free,
+        rehearse=arguments.rehearse,
+        speed=arguments.speed,
+        console=Console(),
+    )
+
+
+def _verify(arguments: argparse.Namespace) -> int:
+    faults, notes = verify(arguments.session)
+    print("\n".join([*notes, *faults]))
+    return BAD_INPUT if faults else OK
 
 
 def _identify(arguments: argparse.Namespace) -> None:
@@ -252,6 +319,46 @@ def _import_arms(arguments: argparse.Namespace) -> None:
     write(arguments.output, with_arms(calibration, arms, FOUND, how))
     print(arms_text(arms), end="")
     print(_written(arguments.output, calibration, arms))
+
+
+def _dither(arguments: argparse.Namespace) -> None:
+    if not 1.0 <= arguments.rate_hz <= 100_000.0:
+        raise InputError(f"--rate-hz: expected 1 to 100000, got {arguments.rate_hz:g}")
+    interval_ns = round(NS_PER_S / arguments.rate_hz)
+    names = NAMES if arguments.rate_filter is None else (arguments.rate_filter,)
+    text = dither_text(
+        read_calibration(arguments.certificate),
+        arguments.amplitude_arcsec,
+        arguments.frequency_hz,
+        [rate_filter(name, interval_ns) for name in names],
+        interval_ns * NS,
+        arguments.case_reaction,
+    )
+    print(text, end="")
+
+
+def _one_or_three(text: str) -> tuple[float, ...]:
+    values = tuple(_not_negative(part) for part in text.split(","))
+    if len(values) not in (1, 3):
+        raise argparse.ArgumentTypeError(f"expected one number or three, got {text!r}")
+    return values * 3 if len(values) == 1 else values
+
+
+def _not_negative(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = nan
+    if not 0.0 <= value < inf:
+        raise argparse.ArgumentTypeError(f"expected a number, not negative, got {text!r}")
+    return value
+
+
+def _positive(text: str) -> float:
+    value = _not_negative(text)
+    if value == 0.0:
+        raise argparse.ArgumentTypeError(f"expected a positive number, got {text!r}")
+    return value
 
 
 class _Kalibr(Model):

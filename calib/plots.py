@@ -18,6 +18,8 @@ from imudrv.units import MM
 Array = NDArray[np.float64]
 
 WIDTH_IN: Final = 7.0
+POINTS: Final = 2000
+"""So many points of a curve are drawn at the least."""
 _COLOURS: Final = ("#1f5fa8", "#b8561a", "#3b7a4b")
 _GREY: Final = "#8a8f98"
 _STYLE: Final[dict[Any, Any]] = {
@@ -180,6 +182,37 @@ def before_after(told: Sequence[RunResult]) -> bytes:
         axes.invert_yaxis()
         axes.grid(visible=False, axis="y")
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7)
+    return canvas.svg
+
+
+def courses(t_s: Array, normal_n: Array, compensated_n: Array, moved_s: tuple[float, float] | None) -> bytes:
+    """Velocity error over time of a navigation without and one with the size effect compensated.
+
+    Parameters
+    ----------
+    t_s : ndarray, shape (n,)
+        Time.
+    normal_n, compensated_n : ndarray, shape (n, 3)
+        Velocities east, north and up, m/s.
+    moved_s : tuple of 2 float, or None
+        The motion.
+
+    Returns
+    -------
+    bytes
+        SVG.
+    """
+    step = max(1, len(t_s) // POINTS)
+    with _canvas(4.2) as canvas:
+        panels = canvas.figure.subplots(3, 1, sharex=True)
+        for k, (axes, name) in enumerate(zip(panels, ("east", "north", "up"), strict=True)):
+            if moved_s is not None:
+                axes.axvspan(*moved_s, color="#eef0f3", linewidth=0)
+            axes.plot(t_s[::step], normal_n[::step, k], color=_COLOURS[1], label="Normal")
+            axes.plot(t_s[::step], compensated_n[::step, k], color=_COLOURS[0], label="Compensation")
+            axes.set_ylabel(f"{name} (m/s)")
+        panels[0].legend(loc="upper left", ncols=2, fontsize=7)
+        panels[-1].set_xlabel("time from the end of the alignment (s)")
     return canvas.svg
 
 

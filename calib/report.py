@@ -3,25 +3,31 @@
 A report is a function of the findings: it tells, and computes nothing but means, extremes and other units.
 """
 
-from base64 import b64encode
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from html import escape
-from io import StringIO
 from itertools import chain
 from math import floor, hypot, log10
-from typing import Final, TypeAlias
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from rich import box
-from rich.console import Console, Group, RenderableType
-from rich.padding import Padding
-from rich.table import Table as RichTable
-from rich.text import Text as RichText
+from rich.console import RenderableType
 from scipy.special import chdtri
 
 from calib import plots
+from calib.document import (
+    Block,
+    Document,
+    Drawing,
+    Pairs,
+    Paragraph,
+    Section,
+    Table,
+    as_html,
+    as_text,
+    blocks_text,
+    for_terminal,
+    printable,
+)
 from calib.findings import Findings, Source, scatter
 from calib.gauge import Arms
 from calib.identify import Identification, Nuisance, RunResult
@@ -29,53 +35,6 @@ from calib.runs import Priors, Run
 from imudrv.units import ARCSEC, DEG, DEG_PER_H, MM, PPM, STANDARD_GRAVITY, UG, URAD
 
 Array = NDArray[np.float64]
-
-WIDTH: Final = 80
-"""Columns of the text."""
-LONG: Final = 15
-"""A table of more rows may be broken by a page's end."""
-
-
-@dataclass(frozen=True)
-class Paragraph:
-    """Running text."""
-
-    text: str
-
-
-@dataclass(frozen=True)
-class Pairs:
-    """What and how much."""
-
-    rows: tuple[tuple[str, str], ...]
-
-
-@dataclass(frozen=True)
-class Table:
-    """Rows under a head; the first column is text, the others numbers."""
-
-    title: str
-    head: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-
-
-@dataclass(frozen=True)
-class Drawing:
-    """A figure, drawn where it is shown."""
-
-    title: str
-    draw: Callable[[], bytes]
-
-
-Block: TypeAlias = Paragraph | Pairs | Table | Drawing
-
-
-@dataclass(frozen=True)
-class Section:
-    """A part of the report with its heading."""
-
-    title: str
-    blocks: tuple[Block, ...]
 
 
 def report_text(findings: Findings, arms: Sequence[Arms]) -> str:
@@ -93,26 +52,17 @@ def report_text(findings: Findings, arms: Sequence[Arms]) -> str:
     str
         Lines.
     """
-    return _text(report_for_terminal(findings, arms))
+    return as_text(_document(findings, arms))
 
 
 def report_for_terminal(findings: Findings, arms: Sequence[Arms]) -> RenderableType:
     """The same for a console of rich's."""
-    sections = _sections(findings, arms)
-    parts: list[RenderableType] = [
-        RichText(_title(findings), style="bold"),
-        RichText(_subtitle(findings)),
-        "",
-    ]
-    for section in sections:
-        parts += [RichText(section.title.upper(), style="bold")]
-        parts += chain.from_iterable(_shown(block) for block in section.blocks)
-    return Group(*parts)
+    return for_terminal(_document(findings, arms))
 
 
 def arms_text(arms: Arms) -> str:
     """Tell lever arms alone, with their gauge, as plain text."""
-    return _text(Group(*_shown(_arms_table(arms))))
+    return blocks_text([_arms_table(arms)])
 
 
 def report_html(findings: Findings, arms: Sequence[Arms]) -> str:
@@ -128,35 +78,25 @@ def report_html(findings: Findings, arms: Sequence[Arms]) -> str:
     str
         The file.
     """
-    body = "\n".join(
-        f"<section>\n<h2>{escape(section.title)}</h2>\n{''.join(map(_marked_up, section.blocks))}</section>"
-        for section in _sections(findings, arms)
-    )
-    return _PAGE.format(
-        style=_STYLE, title=escape(_title(findings)), subtitle=escape(_subtitle(findings)), body=body
-    )
+    return as_html(_document(findings, arms))
 
 
 # The content
 
 
-def _title(findings: Findings) -> str:
-    return f"Inner lever arms of unit {printable(findings.basis.calibration.serial_number)}"
-
-
-def _subtitle(findings: Findings) -> str:
-    return f"Identification of {findings.created:%Y-%m-%d %H:%M} UTC, {findings.software}"
-
-
-def _sections(findings: Findings, arms: Sequence[Arms]) -> tuple[Section, ...]:
-    return (
-        Section("Result", tuple(_result(findings, arms))),
-        Section("What was measured", tuple(_measured(findings))),
-        Section("Rotations", tuple(_rotations(findings))),
-        Section("Motions that do not serve", tuple(_rejected(findings.sources))),
-        Section("Velocity before and after", tuple(_velocities(findings.result))),
-        Section("The estimate", tuple(_estimate(findings))),
-        Section("Limits", tuple(Paragraph(text) for text in _limits(findings, arms[0]))),
+def _document(findings: Findings, arms: Sequence[Arms]) -> Document:
+    return Document(
+        f"Inner lever arms of unit {printable(findings.basis.calibration.serial_number)}",
+        f"Identification of {findings.created:%Y-%m-%d %H:%M} UTC, {findings.software}",
+        (
+            Section("Result", tuple(_result(findings, arms))),
+            Section("What was measured", tuple(_measured(findings))),
+            Section("Rotations", tuple(_rotations(findings))),
+            Section("Motions that do not serve", tuple(_rejected(findings.sources))),
+            Section("Velocity before and after", tuple(_velocities(findings.result))),
+            Section("The estimate", tuple(_estimate(findings))),
+            Section("Limits", tuple(Paragraph(text) for text in _limits(findings, arms[0]))),
+        ),
     )
 
 
@@ -577,122 +517,7 @@ def _count(n: int, what: str) -> str:
     return f"{n} {what}{'' if n == 1 else 's'}"
 
 
-def printable(text: str) -> str:
-    """Text of a file with nothing in it that could steer a terminal."""
-    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
-
-
 _METHODS: Final = {
     "joint": "joint estimate of the arms with biases, tilts and misalignments from all rests",
     "plain": "plain V = H R, one velocity for each rotation",
 }
-
-
-# As text
-
-
-def _text(shown: RenderableType) -> str:
-    out = StringIO()
-    Console(file=out, width=WIDTH, color_system=None).print(shown)
-    return "".join(f"{line.rstrip()}\n" for line in out.getvalue().splitlines())
-
-
-def _shown(block: Block) -> Iterator[RenderableType]:
-    if isinstance(block, Drawing):
-        return
-    if isinstance(block, Paragraph):
-        yield Padding(RichText(block.text), (0, 0, 1, 2))
-    elif isinstance(block, Pairs):
-        grid = RichTable.grid(padding=(0, 2, 0, 0))
-        grid.add_column()
-        grid.add_column(overflow="fold")
-        for name, value in block.rows:
-            grid.add_row(RichText(name, style=_MARKS.get(name, "dim")), RichText(value))
-        yield Padding(grid, (0, 0, 1, 2))
-    else:
-        table = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False)
-        for k, name in enumerate(block.head):
-            table.add_column(RichText(name), justify="right" if k else "left", overflow="fold")
-        for row in block.rows:
-            table.add_row(*map(RichText, row))
-        yield Padding(RichText(block.title), (0, 0, 0, 2))
-        yield Padding(table, (0, 0, 1, 2))
-
-
-_MARKS: Final = {"good": "bold green", "note": "bold", "caution": "bold yellow", "bad": "bold red"}
-
-
-# As HTML
-
-
-def _marked_up(block: Block) -> str:
-    if isinstance(block, Paragraph):
-        return f"<p>{escape(block.text)}</p>\n"
-    if isinstance(block, Drawing):
-        image = b64encode(block.draw()).decode()
-        return (
-            f'<figure><img alt="{escape(block.title)}" src="data:image/svg+xml;base64,{image}">'
-            f"<figcaption>{escape(block.title)}</figcaption></figure>\n"
-        )
-    if isinstance(block, Pairs):
-        rows = "".join(
-            f'<tr><th class="{name if name in _MARKS else "name"}">{escape(name)}</th>'
-            f"<td>{escape(value)}</td></tr>\n"
-            for name, value in block.rows
-        )
-        return f'<table class="pairs">\n{rows}</table>\n'
-    head = "".join(f"<th>{escape(name)}</th>" for name in block.head)
-    rows = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>\n" for row in block.rows)
-    kind = "long" if len(block.rows) > LONG else "short"
-    return (
-        f'<h3>{escape(block.title)}</h3>\n<table class="{kind}">\n<thead><tr>{head}</tr></thead>\n'
-        f"<tbody>\n{rows}</tbody></table>\n"
-    )
-
-
-_STYLE: Final = """
-:root { color-scheme: light; }
-body { font: 15px/1.5 "Helvetica Neue", Arial, "Liberation Sans", sans-serif; color: #22262b;
-       background: #fff; max-width: 54rem; margin: 2.5rem auto; padding: 0 1.5rem; }
-header { border-bottom: 2px solid #1f5fa8; margin-bottom: 1.5rem; }
-h1 { font-size: 1.6rem; font-weight: 600; margin: 0; }
-header p { color: #5b6068; margin: 0.2rem 0 0.8rem; }
-h2 { font-size: 1.1rem; font-weight: 600; margin: 2rem 0 0.6rem; border-bottom: 1px solid #d9dce0; }
-table { border-collapse: collapse; margin: 0.2rem 0 1.2rem; font-size: 0.87rem;
-        font-variant-numeric: tabular-nums; }
-.pairs, .short, tr { break-inside: avoid; }
-h3 { font-size: 0.87rem; font-weight: 600; margin: 1rem 0 0.2rem; break-after: avoid; }
-th, td { padding: 0.15rem 0.75rem; text-align: right; vertical-align: top; }
-th:first-child, td:first-child { text-align: left; padding-left: 0; }
-thead th { border-bottom: 1px solid #8a8f98; font-weight: 500; }
-thead + tbody tr:nth-child(even) { background: #f6f7f9; }
-.pairs td { text-align: left; overflow-wrap: anywhere; }
-.pairs th { text-align: left; font-weight: 500; min-width: 6rem; color: #5b6068; }
-.pairs .good { color: #2c6e3f; } .pairs .caution { color: #9a5b00; } .pairs .bad { color: #b3261e; }
-.pairs .good, .pairs .note, .pairs .caution, .pairs .bad { font-weight: 700; text-transform: uppercase; }
-figure { margin: 0.8rem 0 1.4rem; break-inside: avoid; }
-figure img { width: 100%; height: auto; }
-figcaption { font-size: 0.85rem; color: #5b6068; }
-@media print {
-  body { font-size: 10pt; max-width: none; margin: 0; padding: 0; }
-  h2 { break-after: avoid; }
-  @page { margin: 18mm; }
-}
-"""
-
-_PAGE: Final = """<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta http-equiv="Content-Security-Policy"
-      content="default-src 'none'; img-src data:; style-src 'unsafe-inline'">
-<title>{title}</title>
-<style>{style}</style>
-</head>
-<body>
-<header><h1>{title}</h1><p>{subtitle}</p></header>
-{body}
-</body>
-</html>
-"""

@@ -285,7 +285,8 @@ class Segmenter:
         if self._blocks and self._blocks[-1]["index"][-1] == blocks["index"][0]:
             _join(self._blocks[-1][-1:], blocks[:1])
             blocks = blocks[1:]
-        self._blocks.append(blocks)
+        if len(blocks):
+            self._blocks.append(blocks)
         self._last = int(counter[-1])
 
     @property

@@ -147,7 +147,9 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("file", type=Path, help="the file")
 
     add(
-        "demo", lambda _: demo(print), "The bench procedure on a simulated unit, from wire bytes to velocity."
+        "demo",
+        lambda _: demo(_say),
+        "The whole story on a simulated unit: bench procedure, certificate, proof.",
     )
     return parser
 

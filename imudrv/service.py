@@ -8,11 +8,14 @@ reads, twenty times a second, in microseconds.
 import json
 import os
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from contextlib import ExitStack
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
+from threading import Thread
 from typing import Final
 
 import numpy as np
@@ -30,7 +33,7 @@ from imudrv.profiles import Profile
 from imudrv.records import INCREMENTS, PULSES, Flag
 from imudrv.settings import Settings, default_status_path
 from imudrv.sinks import open_sink
-from imudrv.sinks.base import Batch
+from imudrv.sinks.base import Batch, Sink
 from imudrv.sinks.recorder import Recorder
 from imudrv.status import Status, StatusServer, health
 from imudrv.units import NS, NS_PER_S
@@ -56,6 +59,8 @@ class Service:
         What to do.
     say : callable
         Told each event in a line.
+    sinks : sequence of Sink
+        More ways out than the settings have.
 
     Raises
     ------
@@ -63,7 +68,7 @@ class Service:
         Something in the settings cannot be: all that can be told before the unit is there is told now.
     """
 
-    def __init__(self, settings: Settings, say: Callable[[str], None]) -> None:
+    def __init__(self, settings: Settings, say: Callable[[str], None], sinks: Sequence[Sink] = ()) -> None:
         self._settings = settings
         self._say = say
         self._profile = profiles.load(settings.profile)
@@ -79,6 +84,7 @@ class Service:
         self._pipeline = Pipeline(self._profile, coefficients(self._calibration), self._rates)
         self._latency = Latency(self._layout.interval_ns)
         self._signals = Signals()
+        self._switches: deque[tuple[Path | None, Future[None]]] = deque()
         self._manager = Manager()
         self._notices: list[str] = []
         self._events: list[str] = []
@@ -90,12 +96,15 @@ class Service:
         self._heard_ns = self._began_ns
         self._samples = self._samples_told = self._lost_told = 0
         self._told_ns = self._began_ns
+        self._is_news = False
         self._rate_hz, self._lost_last_s = 0.0, 0
         self._last_pulses = np.zeros(1, PULSES)
         self._last_increments = np.zeros(1, INCREMENTS)
         self._line = b""
         with ExitStack() as undo:
-            self._sinks = []
+            self._sinks = list(sinks)
+            for sink in sinks:
+                undo.callback(sink.close)
             for url in settings.outputs:
                 sink = open_sink(url, self._layout)
                 undo.callback(sink.close)
@@ -104,7 +113,7 @@ class Service:
                 Path(settings.status) if settings.status else default_status_path()
             )
             undo.callback(self._status_server.close)
-            self._recorder = self._open_recorder() if settings.record else None
+            self._recorder = self._open_recorder(Path(settings.record)) if settings.record else None
             self._open = undo.pop_all()
 
     def run(self) -> None:
@@ -123,9 +132,32 @@ class Service:
                 self._manager.tell("STOPPING=1")
                 self._finish()
 
+    def stop(self) -> None:
+        """End `run`, as SIGTERM does; for any thread."""
+        self._signals.stop = True
+
+    def record(self, path: Path | None) -> Future[None]:
+        """Record into another file, or into none; for any thread.
+
+        Parameters
+        ----------
+        path : Path or None
+            From the next read on. There must be no such file yet.
+
+        Returns
+        -------
+        Future
+            Done when the recording before is closed; the `InputError` where the new one cannot be made.
+        """
+        done: Future[None] = Future()
+        self._switches.append((path, done))
+        return done
+
     def _serve(self) -> None:
         attempt, next_attempt_ns, next_poll_ns = 0, 0, 0
         while not self._signals.stop:
+            if self._switches:
+                self._switch_recording()
             now = now_ns()
             if self._port is None and now >= next_attempt_ns:
                 if self._connect():
@@ -207,24 +239,24 @@ class Service:
         if self._port_state == "streaming" and now - self._heard_ns > SILENCE_NS:
             self._port_state, self._trouble = "silent", f"nothing for {SILENCE_NS * NS:g} s"
             self._event("the unit is silent")
-            self._told_ns = min(self._told_ns, now - NS_PER_S)
         elif self._port_state == "silent" and now - self._heard_ns < SILENCE_NS:
             self._port_state, self._trouble = "streaming", ""
             self._event("the unit is back")
         self._manager.alive(now)
-        if now - self._told_ns >= NS_PER_S:
+        if self._is_news or now - self._told_ns >= NS_PER_S:
             self._look_at_calibration()
             self._refresh(now)
         self._status_server.poll(self._line)
 
     def _refresh(self, now: int) -> None:
-        """Make the status anew, once a second."""
+        """Make the status anew: once a second, and when there is news."""
+        self._is_news = False
         seconds = (now - self._told_ns) * NS
-        lost = self._pipeline.accountant.account.lost
-        if seconds > 0.0:
+        if seconds >= 1.0:
+            lost = self._pipeline.accountant.account.lost
             self._rate_hz = (self._samples - self._samples_told) / seconds
             self._lost_last_s = lost - self._lost_told
-        self._samples_told, self._lost_told, self._told_ns = self._samples, lost, now
+            self._samples_told, self._lost_told, self._told_ns = self._samples, lost, now
         status = self.status(now)
         self._line = json.dumps(status).encode() + b"\n"
         if self._recorder is not None:
@@ -263,12 +295,30 @@ class Service:
     def _event(self, text: str) -> None:
         now = now_ns()
         self._events = [*self._events[1 - _SHOWN_EVENTS :], f"{_utc(now)} {text}"]
+        self._is_news = True
         self._say(self._events[-1])
         if self._recorder is not None:
             self._recorder.event(now, text)
 
-    def _open_recorder(self) -> Recorder:
-        path = Path(self._settings.record or "")
+    def _switch_recording(self) -> None:
+        path, done = self._switches.popleft()
+        before, self._recorder = self._recorder, None
+        if path is not None:
+            try:
+                self._recorder = self._open_recorder(path)
+            except InputError as error:
+                done.set_exception(error)
+
+        def close() -> None:
+            if before is not None:
+                before.close()
+            if not done.done():
+                done.set_result(None)
+
+        # It waits for the disk, which the loop must not.
+        Thread(target=close, name="recording's end", daemon=True).start()
+
+    def _open_recorder(self, path: Path) -> Recorder:
         if path.is_dir():
             path = path / f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{os.getpid()}.mcap"
         return Recorder(
@@ -290,6 +340,8 @@ class Service:
         self._refresh(now_ns())
         if self._recorder is not None:
             self._recorder.close()
+        for _, done in self._switches:
+            done.cancel()
         self._open.close()
 
     # What it tells

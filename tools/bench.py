@@ -3,6 +3,7 @@
 
     tools/run python tools/bench.py [--rounds N] [--json]
     tools/run python tools/bench.py live [--seconds N] [--rounds N] [--json]
+    tools/run python tools/bench.py nav [--rounds N] [--json]
 
 A capture with damage in it goes through all stages, piece by piece, in one process on one core. The machine
 and its other work change the figures; the ratios are the message.
@@ -10,6 +11,7 @@ and its other work change the figures; the ratios are the message.
 
 import argparse
 import binascii
+import importlib.util
 import json
 import os
 import platform
@@ -22,6 +24,7 @@ from typing import Final
 import numba
 import numpy as np
 from bench_live import live
+from bench_nav import nav
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
@@ -252,8 +255,8 @@ def machine() -> dict[str, str | int]:
     }
 
 
-def show(measures: list[Measure]) -> None:
-    """Print a table."""
+def show(measures: list[Measure], how: str) -> None:
+    """Print a table, and how it was measured."""
     console = Console()
     console.print(", ".join(f"{name} {value}" for name, value in machine().items()))
     table = Table("stage", "M samples/s", "the other way", "M samples/s", "times")
@@ -264,7 +267,7 @@ def show(measures: list[Measure]) -> None:
         table.add_row(m.stage, ours, m.other_way, theirs, f"{m.ratio:.1f}")
     console.print(table)
     counts = ", ".join(f"{m.samples / 1e6:.1f} M and {m.other_samples / 1e6:.1f} M" for m in measures)
-    console.print(f"One core, {PIECE:,} samples at a time, the best round. Samples of each line: {counts}.")
+    console.print(f"One core, {how}, the best round. Samples of each line: {counts}.")
 
 
 def show_live(quantiles: dict[str, dict[str, float]]) -> None:
@@ -280,12 +283,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--json", action="store_true", help="numbers for a machine instead of a table")
     parser.add_argument(
-        "what", nargs="?", choices=("stages", "live"), default="stages", help="default: stages of the driver"
+        "what",
+        nargs="?",
+        choices=("stages", "live", "nav"),
+        default="stages",
+        help="default: stages of the driver",
     )
-    parser.add_argument("--rounds", type=int, help="default: 12 over 5.4 minutes of samples; live 3 of each")
+    parser.add_argument(
+        "--rounds",
+        type=int,
+        help="default: 12 over 5.4 minutes of samples; live 3 of each; nav 5 over an hour",
+    )
     parser.add_argument("--seconds", type=int, default=20, help="of a live round (default: %(default)s)")
     options = parser.parse_args()
-    rounds = options.rounds or {"stages": 12, "live": 3}[options.what]
+    rounds = options.rounds or {"stages": 12, "live": 3, "nav": 5}[options.what]
     if rounds < 1 or options.seconds < 1:
         parser.error("--rounds, --seconds: expected 1 or more")
     if options.what == "live":
@@ -295,12 +306,21 @@ def main() -> None:
         else:
             show_live(quantiles)
         return
-    measures = throughput(rounds)
+    how, extra = f"{PIECE:,} samples at a time", {}
+    if options.what == "nav":
+        if importlib.util.find_spec("pyins") is None:
+            parser.exit(2, "bench.py nav: expected python-ins, to compare with: pip install python-ins\n")
+        timings, peak_mb = nav(rounds)
+        measures = [Measure(*timing) for timing in timings]
+        how = f"an hour in the pieces of a capture, a row a second, {peak_mb:.0f} MB of memory at the most"
+        extra = {"peak_mb": peak_mb}
+    else:
+        measures = throughput(rounds)
     if options.json:
         rows = [{**asdict(m), "ratio": m.ratio} for m in measures]
-        print(json.dumps({"machine": machine(), "measures": rows}, indent=1))
+        print(json.dumps({"machine": machine(), "measures": rows, **extra}, indent=1))
     else:
-        show(measures)
+        show(measures, how)
 
 
 if __name__ == "__main__":

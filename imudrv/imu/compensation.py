@@ -4,7 +4,7 @@
     dv_b     = C_ba @ (N_a / K - b_a T - dv_r)
 
 with the size effect of accelerometer i, sensing along a_i at r_i, over an interval T with the rates w0 and w1
-at its ends and wm = dtheta_b / T:
+at its ends and wm = dtheta_b / T, or (w0 + w1) / 2 where the filter is to take dither out of it too:
 
     dv_r,i = a_i . { (w1 - w0) x r_i + T/6 ([w0 x]^2 + 4 [wm x]^2 + [w1 x]^2) r_i }
 
@@ -92,11 +92,11 @@ class Coefficients:
 
 
 # Where each constant begins in the kernel's array of constants.
-_KG, _BG, _CBG, _KA, _BA, _CBA, _C, _Q, _TREF, _KG_T, _BG_T, _KA_T, _BA_T = (
+_KG, _BG, _CBG, _KA, _BA, _CBA, _C, _Q, _TREF, _KG_T, _BG_T, _KA_T, _BA_T, _T_ENDS = (
     *(0, 3, 6, 15, 18, 21, 30, 39, 57),
-    *(60, 63, 66, 69),
+    *(60, 63, 66, 69, 72),
 )
-_CONSTANTS: Final = 72
+_CONSTANTS: Final = 73
 _NOTHING: Final = np.zeros(0, INCREMENTS)
 
 _MISSING_BEFORE: Final = int(Flag.MISSING_BEFORE)
@@ -126,6 +126,8 @@ class Compensator:
         self._interval_ns = layout.interval_ns
         self.has_size_effect = coefficients.r_b is not None
         self._constants = _constants(coefficients)
+        if rate_filter.middle_from_ends:
+            self._constants[_T_ENDS] = layout.interval_ns * NS
         terms = coefficients.temperature
         self._range = (terms.low_degc, terms.high_degc) if terms else (np.inf, -np.inf)
         self._channels = _temperature_channels(layout) if terms else np.full(4, -1, np.int64)
@@ -453,8 +455,13 @@ def _fir(taps, history, begin):  # type: ignore[no-untyped-def]
 @kernel
 def _size_effect(m, T, x0, x1, x2, d0, d1, d2, y0, y1, y2):  # type: ignore[no-untyped-def]
     """dv_r of the three accelerometers, m/s, from the rates x and y at the ends and the angle d between."""
-    k = 2.0 / T
-    z0, z1, z2 = k * d0, k * d1, k * d2  # twice the rate between, so that its square counts four times
+    # z is twice the rate between, so that its square counts four times. A bridged interval has its own angle:
+    # the rate bends in it, and over many intervals dither cancels.
+    if m[_T_ENDS] == T:
+        z0, z1, z2 = x0 + y0, x1 + y1, x2 + y2
+    else:
+        k = 2.0 / T
+        z0, z1, z2 = k * d0, k * d1, k * d2
     s0 = x0 * x0 + y0 * y0 + z0 * z0
     s1 = x1 * x1 + y1 * y1 + z1 * z1
     s2 = x2 * x2 + y2 * y2 + z2 * z2

@@ -12,7 +12,7 @@ from imudrv.errors import InputError
 from imudrv.records import Records
 from imudrv.sinks.base import Batch, Sink, SinkState
 from imudrv.sinks.files import CsvTable, increment_columns
-from imudrv.sinks.spool import Spool
+from imudrv.sinks.spool import Piece, Spool
 
 LIMIT: Final = 16_384
 """Samples that wait at the most."""
@@ -74,7 +74,7 @@ class FileSink(Sink):
     def _queued(self) -> int:
         return self._put - self._dropped - self._spool.sent
 
-    def _next_piece(self) -> tuple[bytes, int]:
+    def _next_piece(self) -> Piece:
         batches: list[Batch] = []
         samples = 0
         with suppress(IndexError):
@@ -82,11 +82,12 @@ class FileSink(Sink):
                 batches.append(self._queue.popleft())
                 samples += batches[-1].increments.size
         if not samples:
-            return b"", 0
+            return Piece(b"", 0, False)
+        more = samples >= _PIECE
         if self._table is None:
-            return b"".join(batch.datagrams for batch in batches), samples
+            return Piece(b"".join(batch.datagrams for batch in batches), samples, more)
         self._text.seek(0)
         self._text.truncate()
         increments: Records = np.concatenate([batch.increments for batch in batches])
         self._table.write(increment_columns(increments))
-        return self._text.getvalue(), samples
+        return Piece(self._text.getvalue(), samples, more)

@@ -24,7 +24,7 @@ from imudrv.hostclock import now_ns
 from imudrv.ports.base import Arrival
 from imudrv.recording import pack_messages
 from imudrv.sinks.base import Batch, SinkState
-from imudrv.sinks.spool import Spool
+from imudrv.sinks.spool import Piece, Spool
 from imudrv.wire.datagram import SIZE, Source
 from imudrv.wire.layout import Layout
 
@@ -200,7 +200,7 @@ class Recorder:
     def _attach(self, t_ns: int, name: str, data: bytes) -> None:
         self._writer.add_attachment(t_ns, t_ns, name, "application/yaml", data)
 
-    def _next_piece(self) -> tuple[bytes, int]:
+    def _next_piece(self) -> Piece:
         with suppress(IndexError):
             while True:
                 t_ns, calibration = self._calibrations.popleft()
@@ -210,14 +210,16 @@ class Recorder:
         pieces = pack_messages(data) if self._can and data else data  # type: ignore[arg-type]
         for arrival, piece in zip(arrivals, pieces, strict=True):
             self._message(_WIRE, arrival.t_ns, piece)  # type: ignore[arg-type]
-        datagrams = b"".join(self._datagrams.take(_PIECE))
+        batches = self._datagrams.take(_PIECE)
+        datagrams = b"".join(batches)
         if datagrams:
             self._message(_INCREMENTS, now_ns(), datagrams)
         with suppress(IndexError):
             while True:
                 t_ns, channel, document = self._notes.popleft()
                 self._message(channel, t_ns, json.dumps(document, default=str).encode())
-        return self._staging.take(), len(datagrams) // SIZE
+        more = max(len(arrivals), len(batches)) == _PIECE
+        return Piece(self._staging.take(), len(datagrams) // SIZE, more)
 
     def _last_piece(self) -> bytes:
         self._writer.finish()  # type: ignore[no-untyped-call]

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from threading import Event, Thread
-from typing import Final
+from typing import Final, NamedTuple
 
 from imudrv.errors import InputError
 
@@ -15,6 +15,27 @@ PERIOD_S: Final = 0.05
 _PAUSE_S: Final = 0.002  # between the pieces of a backlog, for the loop to come through
 _LAST_SECONDS_S: Final = 5.0
 _FULL: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+class Piece(NamedTuple):
+    """What is written at a time.
+
+    Parameters
+    ----------
+    data : bytes
+        Not too long; empty when nothing waits.
+    samples : int
+        In it.
+    more : bool
+        Whether more waits already, so that the next piece does not wait for the next round.
+    """
+
+    data: bytes
+    samples: int
+    more: bool
+
+
+_NOTHING: Final = Piece(b"", 0, False)
 
 
 class Spool:
@@ -31,8 +52,7 @@ class Spool:
     head : bytes
         What the file begins with, written at once.
     next_piece : callable
-        Gives the next piece, not too long a one, and the samples in it; an empty piece when nothing waits.
-        Called in the thread.
+        Gives the next piece. Called in the thread.
     last_piece : callable
         Gives what ends the file.
 
@@ -46,7 +66,7 @@ class Spool:
         self,
         path: Path,
         head: bytes,
-        next_piece: Callable[[], tuple[bytes, int]],
+        next_piece: Callable[[], Piece],
         last_piece: Callable[[], bytes] = bytes,
     ) -> None:
         try:
@@ -83,19 +103,20 @@ class Spool:
         self._thread.join(_LAST_SECONDS_S)
 
     def _run(self) -> None:
-        piece, samples = b"", 0
+        piece = _NOTHING
         is_last = False
         while not is_last:
             is_last = self._is_closing.wait(PERIOD_S)
-            while True:
-                if not piece:
-                    piece, samples = self._next_piece()
-                if not piece or not self._append(piece):
+            more = True
+            while more:
+                piece = piece if piece.data else self._next_piece()
+                if not piece.data or not self._append(piece.data):
                     break
-                self.sent += samples
-                piece = b""
-                time.sleep(_PAUSE_S)
-        if not piece:
+                self.sent += piece.samples
+                more, piece = piece.more, _NOTHING
+                if more:
+                    time.sleep(_PAUSE_S)
+        if not piece.data:
             self._append(self._last_piece())
         os.close(self._file)
 

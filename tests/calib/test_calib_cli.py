@@ -10,7 +10,9 @@ import pytest
 import yaml
 
 from calib.cli import main
+from imudrv.calibration import write_calibration
 from imudrv.cli import main as imudrv
+from imudrv.sim.scenario import NOMINAL
 
 SITE = "{latitude_deg: 28.2, longitude_deg: 113.0, height_m: 60.0}"
 SCENARIO = """
@@ -288,3 +290,13 @@ def test_the_reference_captures_through_the_real_command(reference: Path, tmp_pa
     assert document["rank"] == 6
     assert (tmp_path / "r.html").stat().st_size < 1_500_000
     assert all(len(line) <= 80 for line in done.stdout.splitlines())
+
+
+def test_dither_is_told_for_the_arms_of_a_certificate(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_calibration(here / "arms.yaml", NOMINAL)
+    arguments = ["dither", "--amplitude-arcsec", "150", "--frequency-hz", "400,405,393"]
+    assert main([*arguments, "--certificate", "arms.yaml"]) == 0
+    told = capsys.readouterr().out
+    assert "800 Hz   200 Hz" in told  # twice the dither, aliased at 1 kHz
+    assert main([*arguments, "--certificate", "absent.yaml"]) == 2
+    assert "expected a file" in capsys.readouterr().err

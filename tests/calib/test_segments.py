@@ -40,7 +40,7 @@ def test_a_half_turn_is_found_with_its_angle_sign_and_axis(
     assert rotation.after is found.rests[1]
 
 
-@pytest.mark.parametrize("pieces", [2, 7, 1000])
+@pytest.mark.parametrize("pieces", [2, 7, 1000, 8000])
 def test_any_cut_into_pieces_finds_the_same(bench: Bench, step: Step, pieces: int) -> None:
     data = bench(step(20.0), step(2.5, 180.0), step(12.0))
     whole, cut = find_segments([data]), find_segments(np.array_split(data, pieces))

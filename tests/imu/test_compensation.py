@@ -129,7 +129,9 @@ def plainly(pulses: Records, c: Coefficients, f: RateFilter) -> tuple[np.ndarray
                 rates[end] = f.taps @ window / TAU
         for i, (e0, e1) in zip(range(begin, stop), itertools.pairwise(ends), strict=True):
             if c.r_b is not None and e0 in rates and e1 in rates:
-                w0, wm, w1 = (cross_matrix(w) for w in (rates[e0], dtheta_b[i] / T[i], rates[e1]))
+                from_ends = f.middle_from_ends and T[i] == TAU
+                middle = 0.5 * (rates[e0] + rates[e1]) if from_ends else dtheta_b[i] / T[i]
+                w0, wm, w1 = (cross_matrix(w) for w in (rates[e0], middle, rates[e1]))
                 integral = w1 - w0 + T[i] / 6.0 * (w0 @ w0 + 4.0 * wm @ wm + w1 @ w1)
                 dv_r[i] = [a @ integral @ r for a, r in zip(np.linalg.inv(c.C_ba), c.r_b, strict=True)]
                 compensated[i] = True

@@ -1,0 +1,500 @@
+"""Leading through a session: samples in, screen and journal out; the work of a thread of its own.
+
+The service reads the unit in the main thread, as it does in production. One of its sinks is the `Tap`, a
+queue, from which `Conduct` takes samples: it feeds the engine, journals what that says, begins and ends
+recordings, shows the view and reads keys. Engine and session do not know each other.
+
+A session goes through stages: the steps, the result, the decision, the verification. Each leaves its line in
+the journal, so that a session that is resumed goes on behind the last.
+"""
+
+import time
+from collections import deque
+from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import Future, wait
+from dataclasses import asdict, fields, replace
+from queue import Empty, SimpleQueue
+from typing import Final
+
+import numpy as np
+
+from calib.certificate import write
+from calib.console import Keys, Screen, unheard
+from calib.engine import Engine
+from calib.events import (
+    Aborted,
+    Accepted,
+    Conditions,
+    Entered,
+    Event,
+    Finished,
+    Log,
+    Phase,
+    Rejected,
+)
+from calib.gauge import convert
+from calib.journal import Entry
+from calib.procedure import Pose, Procedure, Step, opposite
+from calib.report import arms_text, report_html, verdict
+from calib.result import Left, Result, velocity_left
+from calib.session import REPORT, RESULT, Session
+from imudrv import config
+from imudrv.calibration import Calibration, read_calibration, write_calibration
+from imudrv.errors import InputError
+from imudrv.records import INCREMENTS, Records
+from imudrv.service import Service
+from imudrv.sinks.base import Batch, Sink, SinkState
+from imudrv.sinks.files import replacing
+from imudrv.units import NS_PER_S
+from imudrv.wire.layout import Layout
+
+SHOWN_S: Final = 0.2
+"""The screen is drawn anew this often, and keys are read."""
+VERIFICATION: Final = "verification"
+"""Step id of the rotation at the end."""
+ABORT: Final = "q once more: abort, keep what is accepted. Any other key: go on"
+CLOSED_S: Final = 10.0
+"""So long it is waited for a recording to be closed once the service has ended."""
+
+
+class Tap(Sink):
+    """Way from the service's loop to the worker.
+
+    Parameters
+    ----------
+    most : int or None
+        Samples that may wait; then the loop waits, as only a simulated unit may be asked to. None: any
+        number.
+
+    Attributes
+    ----------
+    is_closed : bool
+        The service has ended; what waits can still be taken.
+    """
+
+    def __init__(self, most: int | None) -> None:
+        super().__init__("bench")
+        self._most = most
+        self._items: SimpleQueue[Batch | str | None] = SimpleQueue()
+        self._put = self._taken = 0
+        self.is_closed = False
+
+    def publish(self, batch: Batch) -> None:
+        """See `Sink.publish`."""
+        self._items.put(batch)
+        self._put += len(batch.pulses)
+        while (most := self._most) is not None and self._put - self._taken > most:
+            time.sleep(0.001)
+
+    def tell(self, text: str) -> None:
+        """Hand on what the service says, in its place among the samples."""
+        self._items.put(text)
+
+    def take(self, timeout_s: float) -> Batch | str | None:
+        """The next item; None at the end. Raises `queue.Empty` when nothing comes in time."""
+        item = self._items.get(timeout=timeout_s)
+        if isinstance(item, Batch):
+            self._taken += len(item.pulses)
+        return item
+
+    @property
+    def state(self) -> SinkState:
+        """See `Sink.state`."""
+        return SinkState(self.url, "ok", True, self._taken, 0, self._put - self._taken)
+
+    def release(self) -> None:
+        """Nobody takes any more: the loop must not wait."""
+        self._most = None
+
+    def close(self) -> None:
+        """See `Sink.close`."""
+        self.is_closed = True
+        self._items.put(None)
+
+
+class _StoppedError(Exception):
+    """The service has ended before the session."""
+
+
+class Conduct:
+    """The worker: leads a session to its end, or as far as it gets.
+
+    Parameters
+    ----------
+    session : Session
+        Open.
+    procedure : Procedure
+        Of the session.
+    layout : Layout
+        Of the unit.
+    service : Service
+        That reads it.
+    tap : Tap
+        One of the service's sinks.
+    screen, keys
+        Of the operator.
+    hands_free : bool
+        Nobody presses keys.
+    begin : callable
+        Told the procedure, of which each step is wanted, before its samples are: a rehearsal begins then.
+
+    Attributes
+    ----------
+    error : BaseException or None
+        What went wrong.
+    outcome : str
+        What has come out, in plain words; empty: the session is not at its end.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        procedure: Procedure,
+        layout: Layout,
+        service: Service,
+        tap: Tap,
+        screen: Screen,
+        keys: Keys,
+        *,
+        hands_free: bool,
+        begin: Callable[[Procedure], None],
+    ) -> None:
+        self.error: BaseException | None = None
+        self.outcome = ""
+        self._session, self._procedure, self._layout = session, procedure, layout
+        self._service, self._tap, self._screen, self._keys = service, tap, screen, keys
+        self._hands_free, self._begin = hands_free, begin
+        self._is_new_to_unit = True
+        self._backlog: deque[Batch] = deque()
+        self._closing: deque[tuple[Future[None], Callable[[], None]]] = deque()
+        self._recording = ""
+        self._trouble = ""
+        self._conditions = Conditions()
+        self._told_ns = 0
+
+    def run(self) -> None:
+        """Work, in a thread of its own."""
+        try:
+            with self._keys:
+                self._stages()
+        except _StoppedError:
+            pass
+        except BaseException as error:
+            self.error = error
+        finally:
+            self._screen.close()
+            self._tap.release()
+            self._service.stop()
+
+    def _stages(self) -> None:
+        session = self._session
+        if self._said("finished") is None:
+            last = self._through(self._procedure)
+            if isinstance(last, Aborted):
+                return
+            if last.reasons:
+                raise InputError(
+                    "\n  ".join(
+                        ["too few steps are accepted; resume for those that were skipped:", *last.reasons]
+                    )
+                )
+            session.append(_entry(last))
+        self._screen.print("The lever arms are computed from the recordings ...")
+        result = self._result()
+        if self._tap.is_closed:
+            raise _StoppedError  # nothing is decided behind a Ctrl-C
+        decision = self._said("decision")
+        if decision is None:
+            decision = {"event": "decision", "accepted": self._decided(result)}
+            session.append(decision)
+        if not decision["accepted"]:
+            self.outcome = f"turned down; {session.plan.certificate} stays as it was"
+            return
+        self._activate(result.certificate)
+        last = self._through(_verification(self._procedure))
+        if isinstance(last, Aborted):
+            return
+        left = self._left(result.certificate) if VERIFICATION in last.accepted else None
+        if self._said("end") is None:
+            self._write_report(result, left)
+            session.append({"event": "end", "velocity_left_m_s": None if left is None else left._asdict()})
+        self.outcome = "\n".join(
+            [
+                f"active certificate: {session.plan.certificate}",
+                f"verification: {left or 'skipped'}",
+                f"report: {session.folder / REPORT}",
+            ]
+        )
+
+    def _said(self, event: str) -> Entry | None:
+        return next((entry for entry in self._session.entries if entry["event"] == event), None)
+
+    # Steps
+
+    def _through(self, procedure: Procedure) -> Finished | Aborted:
+        """Lead through the steps that are not accepted yet; all evidence is filed when it returns."""
+        session = self._session
+        ids = {step.id for step in procedure.steps}
+        accepted = {name: _accepted(entry) for name, entry in session.accepted.items() if name in ids}
+        engine = Engine(
+            procedure,
+            session.site(),
+            session.calibration(),
+            interval_ns=self._layout.interval_ns,
+            hands_free=self._hands_free,
+            accepted=accepted,
+            attempts={name: session.attempt(name) - 1 for name in ids},
+        )
+        last = self._happened(engine, engine.feed(np.zeros(0, INCREMENTS)))
+        if last is None:
+            self._begin(steps_left(procedure, accepted))
+        shown, shown_s = engine.view, 0.0
+        while last is None:
+            batch = self._next()
+            events = () if batch is None else self._sampled(engine, batch)
+            is_due = time.monotonic() - shown_s >= SHOWN_S
+            if is_due and (action := self._keys.action(shown)):
+                events += engine.act(action)
+            last = self._happened(engine, events)
+            self._file_closed()
+            if events or is_due:
+                shown, shown_s = engine.view, time.monotonic()
+                if self._trouble:
+                    shown = unheard(shown, self._trouble)
+                self._screen.show(shown, ABORT if self._keys.asks else "")
+        self._end_recording()
+        while self._closing:
+            if batch := self._take():
+                self._backlog.append(batch)
+            self._file_closed()
+        return last
+
+    def _next(self) -> Batch | None:
+        """Samples, kept or new; None: there is something else to do."""
+        return self._backlog.popleft() if self._backlog else self._take()
+
+    def _take(self) -> Batch | None:
+        try:
+            item = self._tap.take(SHOWN_S)
+        except Empty:
+            return None
+        if isinstance(item, Batch):
+            self._trouble = ""
+            return item
+        if item is None:
+            self._file_all()
+            raise _StoppedError
+        if item.startswith(("port ", "the unit ")):
+            self._trouble = item
+        self._journal({"event": "service", "text": item})
+        return None
+
+    def _sampled(self, engine: Engine, batch: Batch) -> tuple[Event, ...]:
+        events: tuple[Event, ...] = ()
+        if len(batch.pulses):
+            newest = batch.pulses[-1]
+            conditions = _conditions(newest, self._layout)
+            since_ns = int(newest["elapsed_ns"]) - self._told_ns
+            if conditions.bits != self._conditions.bits or not 0 <= since_ns < NS_PER_S:
+                self._conditions, self._told_ns = conditions, int(newest["elapsed_ns"])
+                if self._is_new_to_unit:
+                    self._is_new_to_unit = False
+                    self._recognise(int(newest["counter"]))
+                events = engine.conditions(conditions)
+        return events + engine.feed(batch.increments)
+
+    def _recognise(self, counter: int) -> None:
+        """Whether the unit, heard for the first time in this process, may go on where the session was."""
+        session = self._session
+        session.require_temperature(self._conditions.temperature_degc)
+        newest = max((entry.get("counter", -1) for entry in session.entries), default=-1)
+        self._journal(
+            {
+                "event": "heard",
+                "counter": counter,
+                "restarted": counter < newest,
+                "temperature_degc": dict(self._conditions.temperature_degc),
+            }
+        )
+
+    def _happened(self, engine: Engine, events: Sequence[Event]) -> Finished | Aborted | None:
+        last: Finished | Aborted | None = None
+        for event in events:
+            if isinstance(event, Finished | Aborted):
+                last = event
+            if isinstance(event, Accepted):
+                log = next(log for log in reversed(engine.runs) if log.step_id == event.step_id)
+                self._end_recording(self._filing(event, log))
+                continue
+            if isinstance(event, Rejected):
+                self._end_recording()
+            if isinstance(event, Entered) and event.phase is Phase.PLACE:
+                self._begin_recording(f"run-{event.step_id}-{event.attempt}")
+            if not isinstance(event, Finished):
+                self._journal(_entry(event))
+        return last
+
+    # Recordings; what is said of them waits in a row, so that the journal has all in order
+
+    def _begin_recording(self, name: str) -> None:
+        if name == self._recording:
+            return
+        self._end_recording()
+        self._recording = name
+        self._closing.append((self._service.record(self._session.folder / f"{name}.mcap"), lambda: None))
+
+    def _end_recording(self, then: Callable[[], None] = lambda: None) -> None:
+        name, self._recording = self._recording, ""
+        if not name:
+            return
+
+        def enter() -> None:
+            self._session.enter(f"{name}.mcap")
+            then()
+
+        self._closing.append((self._service.record(None), enter))
+
+    def _filing(self, event: Accepted, log: Log) -> Callable[[], None]:
+        """File an accepted attempt: its log, then the line that makes it count."""
+        name, degc = self._recording, dict(self._conditions.temperature_degc)
+
+        def file() -> None:
+            with replacing(self._session.folder / f"{name}.npz") as archive:
+                np.savez(archive, **{f.name: getattr(log, f.name) for f in fields(log)})
+            self._session.enter(f"{name}.npz")
+            self._session.append({**_entry(event), "recording": f"{name}.mcap", "temperature_degc": degc})
+
+        return file
+
+    def _journal(self, entry: Entry) -> None:
+        if not self._closing:
+            self._session.append(entry)
+            return
+        done: Future[None] = Future()
+        done.set_result(None)
+        self._closing.append((done, lambda: self._session.append(entry)))
+
+    def _file_closed(self) -> None:
+        while self._closing and self._closing[0][0].done():
+            closed, then = self._closing.popleft()
+            closed.result()
+            then()
+
+    def _file_all(self) -> None:
+        """The service has ended, and all recordings with it."""
+        while self._closing:
+            closed, then = self._closing.popleft()
+            wait([closed], CLOSED_S)
+            then()
+        if self._recording:
+            self._session.enter(f"{self._recording}.mcap")
+
+    # After the steps
+
+    def _result(self) -> Result:
+        session = self._session
+        result = session.identify()
+        path = session.folder / RESULT
+        if RESULT in session.files:
+            return result._replace(certificate=read_calibration(path))
+        path.unlink(missing_ok=True)  # of a process that was killed before it entered it
+        write_calibration(path, result.certificate)
+        session.enter(RESULT)
+        return result
+
+    def _decided(self, result: Result) -> bool:
+        self._screen.print(_summary(result))
+        if self._hands_free:
+            return all(mark != "bad" for mark, _ in verdict(result.findings))
+        self._screen.print(f"Accept it as the certificate of unit {self._session.plan.unit}? [y/n]")
+        self._keys.read()  # what was typed before the question is no answer to it
+        answer = ""
+        while not answer:
+            self._take()
+            answer = next((key for key in self._keys.read() if key in "yn"), "")
+        return answer == "y"
+
+    def _activate(self, certificate: Calibration) -> None:
+        """Make it the active one, unless it is already."""
+        session = self._session
+        active = session.plan.certificate
+        digest = config.sha256(active)
+        if digest == session.plan.certificate_sha256:
+            write(active, certificate)
+        elif digest != session.files[RESULT]:
+            raise InputError(
+                f"{active}: expected the certificate that the session began with, it was changed meanwhile; "
+                f"it stays so, the result is in {session.folder / RESULT}"
+            )
+
+    def _left(self, certificate: Calibration) -> Left:
+        """Velocity left by the verification rotation."""
+        session, procedure = self._session, _verification(self._procedure)
+        attempt = session.attempt_at(procedure.steps[0])
+        return velocity_left(procedure, attempt, certificate, session.site())
+
+    def _write_report(self, result: Result, left: Left | None) -> None:
+        findings = result.findings
+        html = report_html(findings, (findings.arms, convert(findings.arms, "x")))
+        words = "was skipped" if left is None else f"with the new certificate: {left}"
+        section = f"<section>\n<h2>Verification</h2>\n<p>One more rotation {words}.</p>\n</section>"
+        with replacing(self._session.folder / REPORT) as file:
+            file.write(html.replace("</section>", f"</section>\n{section}", 1).encode())  # behind the result
+        self._session.enter(REPORT)
+
+
+def steps_left(procedure: Procedure, done: Collection[str]) -> Procedure:
+    """The procedure of the steps that are not done.
+
+    Parameters
+    ----------
+    procedure : Procedure
+        The whole one.
+    done : collection of str
+        Ids of steps; not all of them.
+
+    Returns
+    -------
+    Procedure
+    """
+    return _procedure(procedure, [step for step in procedure.steps if step.id not in done])
+
+
+def _verification(procedure: Procedure) -> Procedure:
+    """One more rotation, from where the last one ended."""
+    last = procedure.steps[-1]
+    return _procedure(procedure, [replace(last, id=VERIFICATION, east=opposite(last.east))])
+
+
+def _procedure(procedure: Procedure, steps: Sequence[Step]) -> Procedure:
+    """The same with other steps."""
+    poses = tuple(Pose.model_validate(vars(step)) for step in steps)
+    return procedure.model_copy(update={"poses": poses})
+
+
+def _summary(result: Result) -> str:
+    """What the operator has to know to decide."""
+    verdicts = [f"{mark}: {text}" for mark, text in verdict(result.findings)]
+    return "\n".join([arms_text(result.findings.arms), *verdicts])
+
+
+def _entry(event: Event) -> Entry:
+    return {"event": type(event).__name__.lower(), **asdict(event)}
+
+
+def _accepted(entry: Entry) -> Accepted:
+    values = {f.name: entry[f.name] for f in fields(Accepted)}
+    return Accepted(**{**values, "v_n": tuple(values["v_n"])})
+
+
+def _conditions(pulses: Records, layout: Layout) -> Conditions:
+    """What a sample tells beside its pulses."""
+
+    def names(word: int) -> tuple[str, ...]:
+        return tuple(name for bit, name in layout.status_names if word >> bit & 1)
+
+    word = int(pulses["status"])
+    degc = zip(layout.temperature_names, pulses["temperature_degc"].tolist(), strict=False)
+    return Conditions(
+        names(word), names(word & layout.status.fault), {name: t if t == t else None for name, t in degc}
+    )

@@ -1,0 +1,297 @@
+"""The bench's screen and keys: what to do now, readable from two metres; a function of the engine's `View`.
+
+On a terminal the screen is redrawn in place; elsewhere (a pipe, ``TERM=dumb``) each change is a line.
+"""
+
+import os
+import select
+import sys
+import termios
+import textwrap
+import tty
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from types import TracebackType
+from typing import Any, Final, Self
+
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from calib import letters
+from calib.events import Abort, Action, Confirm, Phase, Redo, Skip, View
+
+UNHEARD: Final = "NO DATA: CHECK THE CABLE"
+"""Headline while nothing comes from the unit."""
+_OTHER_ROWS: Final = 8
+"""Rows beside headline, hints and reasons; one is left free, for a terminal that scrolls behind the last."""
+_FEWEST: Final = 2
+_MOST_HINTS: Final = 3
+_MOST_REASONS: Final = 5
+"""Rows of hints and reasons; so few that the headline keeps its room."""
+_NAMES: Final = {"confirm": "Enter", "redo": "r", "skip": "s", "abort": "q"}
+_ACTIONS: Final = {"\n": "confirm", "\r": "confirm", "r": "redo", "s": "skip", "q": "abort"}
+_BY_STEP: Final[dict[str, Callable[[str], Action]]] = {"confirm": Confirm, "redo": Redo, "skip": Skip}
+_STYLES: Final = {
+    Phase.PREFLIGHT: "white on blue",
+    Phase.PLACE: "white on blue",
+    Phase.SETTLE: "black on yellow",
+    Phase.ALIGN: "black on yellow",
+    Phase.ROTATE: "white on magenta",
+    Phase.REST: "black on yellow",
+    Phase.VERDICT: "black on green",
+    Phase.DONE: "black on green",
+    Phase.ABORTED: "white on red",
+}
+
+
+def unheard(view: View, why: str) -> View:
+    """A view while nothing comes from the unit: that has to be mended first.
+
+    Parameters
+    ----------
+    view : View
+        Of the engine.
+    why : str
+        What the service says.
+
+    Returns
+    -------
+    View
+    """
+    return replace(view, headline=UNHEARD, reasons=(why, *view.reasons))
+
+
+def screen(
+    view: View, width: int, height: int, question: str = "", ascii_only: bool = False
+) -> RenderableType:
+    """Draw a view; fits 80 columns and 24 lines.
+
+    Parameters
+    ----------
+    view : View
+        Of the engine.
+    width, height : int
+        Of the terminal, cells.
+    question : str
+        In the place of the keys.
+    ascii_only : bool
+        The terminal knows no blocks.
+
+    Returns
+    -------
+    renderable
+    """
+    top = Table.grid(expand=True)
+    top.add_column(no_wrap=True, overflow="ellipsis")
+    top.add_column(justify="right", no_wrap=True)
+    where = f"{view.phase.value.upper()} {_time(view.remaining_s)}"
+    top.add_row(Text(view.title, "bold"), Text(where, "bold"))
+    hints = _wrapped(view.hints, width, _FEWEST, _MOST_HINTS)
+    reasons = _wrapped(view.reasons, width, _FEWEST, _MOST_REASONS)
+    free = height - _OTHER_ROWS - len(hints) - len(reasons)
+    return Group(
+        top,
+        _banner(view, width, max(1, free), ascii_only),
+        Text("\n".join(hints)),
+        _figures(view, width, ascii_only),
+        Text("\n".join(reasons), "bold red"),
+        Text((question or _keys(view.actions))[:width], "bold red" if question else "dim"),
+    )
+
+
+def plain(view: View, question: str = "") -> str:
+    """A view in a line; what changes all the time is left out."""
+    parts = [view.title, f"{view.phase.value}: {view.headline}", *view.hints]
+    parts += [f"! {reason}" for reason in (*view.reasons, question) if reason]
+    return " | ".join(part for part in parts if part)
+
+
+class Keys:
+    """Keys, and what they ask for; Ctrl-C stays the system's.
+
+    Where standard input is no terminal there are none.
+    """
+
+    def __init__(self) -> None:
+        self.there = sys.stdin.isatty()
+        self.asks = False
+        self._fd = sys.stdin.fileno() if self.there else -1
+        self._before: Any = None
+
+    def __enter__(self) -> Self:
+        if self.there:
+            self._before = termios.tcgetattr(self._fd)
+            tty.setcbreak(self._fd)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
+    ) -> None:
+        if self.there:
+            termios.tcsetattr(self._fd, termios.TCSADRAIN, self._before)
+
+    def read(self) -> str:
+        """What was typed since the last time; a key that sends more than a character is left out."""
+        if not self.there or not select.select([self._fd], [], [], 0.0)[0]:
+            return ""
+        typed = os.read(self._fd, 1024).decode(errors="replace")
+        return "" if typed.startswith("\x1b") else typed.lower()
+
+    def action(self, view: View) -> Action | None:
+        """What was asked for, if it makes sense now; an abort only once it was asked for again.
+
+        Parameters
+        ----------
+        view : View
+            What the operator sees.
+
+        Returns
+        -------
+        Confirm, Redo, Skip, Abort or None
+        """
+        for key in self.read():
+            name = _ACTIONS.get(key)
+            asked, self.asks = self.asks, False
+            if name not in view.actions:
+                continue
+            if name == "abort":
+                if asked:
+                    return Abort()
+                self.asks = True
+                continue
+            return _BY_STEP[name](view.step_id)
+        return None
+
+
+class Screen:
+    """Where views are shown.
+
+    Parameters
+    ----------
+    console : Console
+        Of rich. Without a terminal, or on a dumb one, it gets plain lines.
+    """
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._is_plain = not console.is_terminal or console.is_dumb_terminal
+        self._live: Live | None = None
+        self._bells = 0
+        self._last = ""
+
+    def show(self, view: View, question: str = "") -> None:
+        """Show a view.
+
+        Parameters
+        ----------
+        view : View
+            Of the engine.
+        question : str
+            In the place of the keys.
+        """
+        if view.bells > self._bells and not self._is_plain:
+            self._console.bell()
+        self._bells = view.bells
+        if self._is_plain:
+            self.say(plain(view, question))
+            return
+        if self._live is None:
+            self._live = Live(console=self._console, auto_refresh=False, screen=True)
+            self._live.start()
+        size = self._console.size
+        ascii_only = self._console.options.ascii_only
+        self._live.update(screen(view, size.width, size.height, question, ascii_only), refresh=True)
+
+    def say(self, text: str) -> None:
+        """Print a line, unless it was the last one or a screen stands in its place."""
+        if text != self._last and self._live is None:
+            self._console.print(text, markup=False, highlight=False, soft_wrap=True)
+            self._last = text
+
+    def print(self, what: RenderableType) -> None:
+        """Take the screen away and print something that stays."""
+        self.close()
+        self._console.print(what, markup=False, highlight=False)
+
+    def close(self) -> None:
+        """Give the terminal back."""
+        if self._live is not None:
+            self._live.stop()
+            self._live = None
+
+
+def _time(seconds: float | None) -> str:
+    return "" if seconds is None else f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
+
+
+def _banner(view: View, width: int, height: int, ascii_only: bool) -> RenderableType:
+    refused = view.reasons and view.phase in (Phase.PREFLIGHT, Phase.PLACE, Phase.VERDICT)
+    style = "white on red" if refused or view.headline == UNHEARD else _STYLES[view.phase]
+    inside = width - 2
+    scale, lines = letters.fitted(view.headline, inside, height)
+    if ascii_only and scale < 2:
+        scale = 0
+    if scale:
+        drawn = [letters.blocks(line, scale, ascii_only) for line in lines]
+        rows = drawn[0] + [row for block in drawn[1:] for row in ["", *block]]
+    else:
+        rows = [view.headline]
+    free = height - len(rows)
+    rows = ["" for _ in range(free // 2)] + rows + ["" for _ in range(free - free // 2)]
+    text = "\n".join(row.center(width)[:width] for row in rows)
+    return Text(text, f"bold {style}", no_wrap=True, overflow="crop")
+
+
+def _wrapped(texts: Sequence[str], width: int, fewest: int, most: int) -> list[str]:
+    """Rows of texts, each beginning on a row of its own; what is over ends with an ellipsis."""
+    rows = [row for text in texts for row in textwrap.wrap(text, width)]
+    if len(rows) > most:
+        rows = [*rows[: most - 1], textwrap.shorten(" ".join(rows[most - 1 :]), width, placeholder=" ...")]
+    return rows + [""] * (fewest - len(rows))
+
+
+def _figures(view: View, width: int, ascii_only: bool) -> RenderableType:
+    """Live bars: angle, rate, stillness, time, and the sigmas."""
+    room = width - 10 - 24
+    full = view.want_deg or 180.0
+    angle = "" if view.angle_deg is None else f"{view.angle_deg:+.1f} of {full:+.0f} deg"
+    table = Table.grid(padding=(0, 1))
+    table.add_column(width=9, style="bold")
+    table.add_column(width=room, no_wrap=True)
+    table.add_column(no_wrap=True, overflow="ellipsis")
+
+    def add(name: str, part: float | None, style: str, text: str) -> None:
+        table.add_row(name, _bar(part, room, style, ascii_only), text)
+
+    add("angle", (view.angle_deg or 0.0) / full, "magenta", angle)
+    add("rate", abs(view.rate_deg_per_s) / 150.0, "cyan", f"{abs(view.rate_deg_per_s):.0f} deg/s")
+    add(
+        "still",
+        view.stillness,
+        "green" if view.stillness > 0.8 else "red",
+        "" if view.stillness > 0.8 else "moves",
+    )
+    add("progress", view.progress, "yellow", _percent(view.progress))
+    sigmas = [
+        f"{name} {sigma:.4f} deg"
+        for name, sigma in (("level", view.level_sigma_deg), ("heading", view.heading_sigma_deg))
+        if sigma is not None
+    ]
+    table.add_row("1 sigma", ", ".join(sigmas), "")
+    return table
+
+
+def _percent(part: float | None) -> str:
+    return "" if part is None else f"{part:.0%}"
+
+
+def _bar(part: float | None, width: int, style: str, ascii_only: bool) -> Text:
+    filled = round(min(max(part or 0.0, 0.0), 1.0) * width)
+    full, empty = ("#", "-") if ascii_only else ("█", "░")
+    return Text.assemble((full * filled, style), (empty * (width - filled), "dim"))
+
+
+def _keys(actions: Sequence[str]) -> str:
+    return "   ".join(f"{_NAMES[name]}: {name}" for name in _NAMES if name in actions)

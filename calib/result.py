@@ -1,0 +1,249 @@
+"""What the accepted recordings give: the lever arms, and the velocity that a rotation leaves.
+
+All is made again from the wire bytes of the recordings, cut to the samples that the engine's verdict rests
+on.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from itertools import islice
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from calib.certificate import certificate, software
+from calib.findings import Basis, Findings, Source, Temperature
+from calib.identify import joint
+from calib.procedure import Procedure, Step
+from calib.runs import Evidence, Priors, Run, collect
+from calib.segments import BLOCK_NS
+from imudrv import config
+from imudrv.calibration import Calibration, coefficients
+from imudrv.errors import InputError
+from imudrv.imu.accounting import Account, Accountant
+from imudrv.imu.compensation import Coefficients, Compensator
+from imudrv.imu.rate_filter import rate_filter
+from imudrv.recording import Recording
+from imudrv.records import Records
+from imudrv.site import Site
+from imudrv.units import MM, NS
+from imudrv.wire.decoder import FrameDecoder
+from imudrv.wire.layout import Layout
+
+LEFT_S: Final = 0.5
+"""Velocity left by a rotation is the mean over so long after it, less that before it."""
+_AT_ONCE: Final = 1000
+"""Reads of the port that are decoded together: live each brings one sample."""
+
+
+class Attempt(NamedTuple):
+    """An accepted attempt at a step.
+
+    Attributes
+    ----------
+    step : Step
+        What was done.
+    recording : Path
+        Its recording.
+    first_counter, last_counter : int
+        Samples that the verdict rests on, both included, as the service counted them.
+    """
+
+    step: Step
+    recording: Path
+    first_counter: int
+    last_counter: int
+
+
+class Result(NamedTuple):
+    """What the accepted recordings give.
+
+    Attributes
+    ----------
+    findings : Findings
+        The identification.
+    certificate : Calibration
+        The unit's new one.
+    """
+
+    findings: Findings
+    certificate: Calibration
+
+
+class Left(NamedTuple):
+    """Horizontal velocity that a rotation left, m/s.
+
+    Attributes
+    ----------
+    without, compensated : float
+        With the size effect in, and with it compensated.
+    """
+
+    without: float
+    compensated: float
+
+    def __str__(self) -> str:
+        """For people."""
+        return (
+            f"half a turn leaves {self.without / MM:.1f} mm/s with the size effect in, "
+            f"{self.compensated / MM:.1f} mm/s with it compensated"
+        )
+
+
+class _Heard(NamedTuple):
+    """What a recording holds of an attempt."""
+
+    pulses: Records  # of the evidence
+    layout: Layout
+    account: Account  # of the whole recording
+
+
+def identify(procedure: Procedure, attempts: Sequence[Attempt], basis: Basis, site: Site) -> Result:
+    """Find the lever arms.
+
+    Parameters
+    ----------
+    procedure : Procedure
+        That was carried out.
+    attempts : sequence of Attempt
+        The accepted ones.
+    basis : Basis
+        The certificate before; its size effect is not used.
+    site : Site
+        Where the unit stood.
+
+    Returns
+    -------
+    Result
+
+    Raises
+    ------
+    InputError
+        A recording cannot be read or lacks its rotation, or `joint` refuses.
+    """
+    priors = Priors()
+    known = replace(coefficients(basis.calibration), r_b=None)
+    sources = tuple(_source(procedure, attempt, known, site, priors) for attempt in attempts)
+    findings = Findings(
+        joint([run for source in sources for run in source.evidence.runs], priors),
+        basis,
+        site,
+        procedure.rotation_limits(procedure.steps[0]),
+        priors,
+        sources,
+        datetime.now(UTC).replace(microsecond=0),
+        software(),
+    )
+    return Result(findings, certificate(findings, findings.arms))
+
+
+def velocity_left(procedure: Procedure, attempt: Attempt, calibration: Calibration, site: Site) -> Left:
+    """Tell what compensation does for a rotation.
+
+    Parameters
+    ----------
+    procedure : Procedure
+        With the attempt's step.
+    attempt : Attempt
+        An accepted one.
+    calibration : Calibration
+        With its size effect.
+    site : Site
+        Where the unit stands.
+
+    Returns
+    -------
+    Left
+
+    Raises
+    ------
+    InputError
+        The recording cannot be read or lacks its rotation.
+    """
+    known, heard = coefficients(calibration), _hear(attempt)
+    rows = round(LEFT_S / (BLOCK_NS * NS))
+    left = []
+    for c in (replace(known, r_b=None), known):
+        run = _collected(procedure, attempt, heard, c, site, Priors()).runs[0]
+        gained = _mean(run, run.after, slice(rows)) - _mean(run, run.before, slice(-rows, None))
+        left.append(float(np.hypot(gained[0], gained[1])))
+    return Left(*left)
+
+
+def _mean(run: Run, rest: np.ndarray, rows: slice) -> np.ndarray:
+    mean: np.ndarray = run.v_n[rest][rows].mean(axis=0)
+    return mean
+
+
+def _source(
+    procedure: Procedure, attempt: Attempt, known: Coefficients, site: Site, priors: Priors
+) -> Source:
+    heard = _hear(attempt)
+    degc = heard.pulses["temperature_degc"]
+    return Source(
+        attempt.recording.stem,
+        attempt.recording.name,
+        config.sha256(attempt.recording),
+        heard.layout.name,
+        str(heard.account),
+        tuple(
+            Temperature(name, float(t.min()), float(t.max()))
+            for name, column in zip(heard.layout.temperature_names, degc.T, strict=False)
+            if (t := column[~np.isnan(column)]).size
+        ),
+        _collected(procedure, attempt, heard, known, site, priors),
+    )
+
+
+def _collected(
+    procedure: Procedure, attempt: Attempt, heard: _Heard, known: Coefficients, site: Site, priors: Priors
+) -> Evidence:
+    layout = heard.layout
+    compensator = Compensator(known, layout, rate_filter("causal", layout.interval_ns))
+    increments = [compensator.feed(heard.pulses), compensator.close()]
+    evidence = collect(
+        lambda: increments,
+        known.C_ba,
+        site,
+        label=attempt.recording.stem,
+        limits=procedure.rotation_limits(attempt.step),
+        priors=priors,
+        expected=attempt.step.up[1],
+    )
+    if len(evidence.runs) != 1:
+        reasons = "; ".join(reason for _, reasons in evidence.rejected for reason in reasons) or "no motion"
+        raise InputError(
+            f"{attempt.recording}: expected the one rotation that was accepted, got {len(evidence.runs)}: "
+            f"{reasons}"
+        )
+    return evidence
+
+
+def _hear(attempt: Attempt) -> _Heard:
+    """Decode a recording and cut it to the evidence."""
+    recording = Recording(attempt.recording)
+    layout = recording.profile.layout()
+    decoder, accountant = FrameDecoder(layout), Accountant(layout)
+    pulses = [accountant.feed(decoder.feed(data)) for data in _wire(recording)]
+    pulses.append(accountant.feed(decoder.close()))
+    heard = np.concatenate(pulses)
+    counter = heard["counter"]
+    if not len(counter):
+        raise InputError(f"{attempt.recording}: expected samples of {layout.name}, got none")
+    # The unit's counter may have gone round since the service began; a recording ends soon after its
+    # evidence.
+    period = 1 << layout.counter_bits
+    counter = counter + round((attempt.last_counter - int(counter[-1])) / period) * period
+    backward = np.flatnonzero(np.diff(counter) <= 0)  # the unit restarted before the evidence
+    begin = int(backward[-1]) + 1 if len(backward) else 0
+    first, stop = np.searchsorted(counter[begin:], [attempt.first_counter, attempt.last_counter + 1])
+    return _Heard(heard[begin + first : begin + stop], layout, accountant.account)
+
+
+def _wire(recording: Recording) -> Iterator[bytes | Records]:
+    """The wire of a recording in larger pieces."""
+    arrivals = (arrival.data for arrival in recording.arrivals())
+    while pieces := list(islice(arrivals, _AT_ONCE)):
+        yield np.concatenate(pieces) if isinstance(pieces[0], np.ndarray) else b"".join(pieces)  # type: ignore[arg-type]

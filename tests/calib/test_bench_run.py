@@ -1,0 +1,314 @@
+"""The whole bench procedure through a real pty: the unit simulated in another process, in fast time."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from calib import bench
+from calib.bench import SEED
+from calib.findings import Basis
+from calib.journal import Journal, begin
+from calib.procedure import load
+from calib.rehearsal import BENCH, technician
+from calib.result import Attempt, identify
+from calib.session import JOURNAL, verify
+from imudrv.calibration import SizeEffect, read_calibration
+from imudrv.config import sha256
+from imudrv.errors import InputError
+
+# The alignment is short: of what follows from it, heading and biases, the joint estimate finds most anew.
+PROCEDURE = """
+format: imu50-procedure
+version: 1
+name: short
+align_s: 40
+rest_s: 8
+poses:
+  - {id: z-up, up: +Z, east: +X, turn_deg: 180}
+  - {id: x-up, up: +X, east: +Y, turn_deg: 180}
+  - {id: y-up, up: +Y, east: +Z, turn_deg: 180}
+"""
+STEPS = ["z-up", "x-up", "y-up"]
+DEADLINE_S = 300.0
+RUN = """
+import sys
+from pathlib import Path
+from rich.console import Console
+from calib.bench import run
+from imudrv.console import guarded
+procedure, folder = sys.argv[1:]
+sys.exit(guarded(lambda: run(
+    procedure=procedure, folder=Path(folder), rehearse=True, speed="max", console=Console(width=200)
+)))
+"""
+
+
+def start(folder: Path) -> subprocess.Popen[str]:
+    """Begin a rehearsal, or go on with it."""
+    procedure = folder.parent / "short.yaml"
+    procedure.write_text(PROCEDURE)
+    return subprocess.Popen(
+        [sys.executable, "-c", RUN, str(procedure), str(folder)],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def journal(folder: Path) -> list[dict[str, Any]]:
+    """Whole lines of the journal; it may be written to meanwhile."""
+    path = folder / JOURNAL
+    text = path.read_text() if path.exists() else ""
+    return [json.loads(line) for line in text.split("\n")[:-1]]
+
+
+def until(process: subprocess.Popen[str], true: Callable[[], bool]) -> None:
+    """Wait for something that must come; the deadline only ends a broken test."""
+    end = time.monotonic() + DEADLINE_S
+    while not true():
+        if process.poll() is not None or time.monotonic() > end:
+            process.kill()
+            raise AssertionError("\n".join(process.communicate()))
+        time.sleep(0.01)
+
+
+def ended(process: subprocess.Popen[str]) -> str:
+    out, err = process.communicate(timeout=DEADLINE_S)
+    assert process.returncode == 0, out + err
+    return out
+
+
+def size_effect(folder: Path) -> SizeEffect:
+    found = read_calibration(folder / "certificate.yaml").size_effect
+    assert found is not None
+    return found
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    folder = tmp_path_factory.mktemp("bench") / "undisturbed"
+    return folder, ended(start(folder))
+
+
+def test_the_result_is_within_three_sigma_of_the_truth_and_a_twentieth_of_a_millimetre_rms(
+    undisturbed: tuple[Path, str],
+) -> None:
+    check_true(undisturbed[0])
+
+
+def test_the_operator_is_led_through_every_step_and_told_what_has_come_out(
+    undisturbed: tuple[Path, str],
+) -> None:
+    folder, said = undisturbed
+    for step in ("Z up", "X up", "Y up"):
+        for words in ("HANDS OFF, ALIGNING", "DONE"):
+            assert any(step in line and words in line for line in said.splitlines())
+    assert f"report: {folder / 'report.html'}" in said
+    assert "half a turn leaves" in said
+
+
+def test_the_active_certificate_is_the_result_and_the_old_one_is_kept(undisturbed: tuple[Path, str]) -> None:
+    folder, _ = undisturbed
+    active = folder / "rehearsal" / "unit.yaml"
+    assert active.read_bytes() == (folder / "certificate.yaml").read_bytes()
+    (kept,) = active.parent.glob("unit.*Z.yaml")
+    assert kept.read_bytes() == (folder / "before.yaml").read_bytes()
+
+
+def test_a_last_rotation_shows_what_compensation_does_and_the_report_tells_it(
+    undisturbed: tuple[Path, str],
+) -> None:
+    folder, said = undisturbed
+    left = journal(folder)[-1]["velocity_left_m_s"]
+    # Arms of 20 to 50 mm leave 50 to 150 mm/s; what is left then is tilt and bias over the turn, 2 mm/s.
+    assert left["without"] > 0.03
+    assert left["compensated"] < 0.1 * left["without"]
+    words = said[said.index("half a turn leaves") :].splitlines()[0]
+    assert words in (folder / "report.html").read_text()
+
+
+def test_velocity_and_h_of_every_sample_of_every_run_are_logged_once(undisturbed: tuple[Path, str]) -> None:
+    folder, _ = undisturbed
+    accepted = [entry for entry in journal(folder) if entry["event"] == "accepted"]
+    assert [entry["step_id"] for entry in accepted] == [*STEPS, "verification"]
+    newest = -1
+    for entry in accepted[:3]:
+        with np.load(folder / entry["recording"].replace(".mcap", ".npz")) as log:
+            counter = log["counter"]
+            assert (np.diff(counter) == 1).all()
+            assert counter[0] > newest
+            assert counter[-1] == entry["last_counter"]
+            assert log["v_n"].shape == (len(counter), 3)
+            assert log["H"].shape == (len(counter), 3, 9)
+            assert (np.abs(log["H"][-1, :2]) > 1e-3).any()
+        newest = int(counter[-1])
+
+
+def test_the_session_computes_again_and_a_flipped_bit_in_its_evidence_is_named(
+    undisturbed: tuple[Path, str],
+) -> None:
+    folder, _ = undisturbed
+    verified = verify(folder)
+    assert verified.faults == ()
+    assert "the recordings give the certificate, digit for digit" in verified.notes
+    recording = folder / "run-x-up-1.mcap"
+    data = recording.read_bytes()
+    damaged = bytearray(data)
+    damaged[len(data) // 2] ^= 16
+    recording.write_bytes(damaged)
+    (fault,) = verify(folder).faults
+    recording.write_bytes(data)
+    assert fault.startswith(f"{recording}: was damaged or changed")
+
+
+def test_a_certificate_that_the_recordings_do_not_give_is_named_though_every_hash_fits(
+    undisturbed: tuple[Path, str], tmp_path: Path
+) -> None:
+    folder, _ = undisturbed
+    forged = tmp_path / "forged"
+    forged.mkdir()
+    for path in folder.iterdir():
+        if path.is_file():
+            (forged / path.name).symlink_to(path)
+    certificate = (folder / "certificate.yaml").read_text()
+    r_x = f"{size_effect(folder).r_mm.x[0]}"
+    (forged / "certificate.yaml").unlink()
+    (forged / "certificate.yaml").write_text(certificate.replace(r_x, f"{r_x}1", 1))
+    lines = (forged / JOURNAL).read_text().splitlines()
+    (forged / JOURNAL).unlink()
+    rewritten = [
+        {**json.loads(line), **({"sha256_of_file": sha256(forged / "certificate.yaml")} if ok else {})}
+        for line in lines
+        for ok in ['"name": "certificate.yaml"' in line]
+    ]
+    for number, entry in enumerate(rewritten):
+        entry.pop("before")
+        entry.pop("sha256")
+        if number == 0:
+            begin(forged / JOURNAL, entry)
+            forger = Journal(forged / JOURNAL)
+        else:
+            forger.append(entry)
+    forger.close()
+    (fault,) = verify(forged).faults
+    assert fault.startswith(f"{forged / 'certificate.yaml'}: expected what the recordings give")
+
+
+def test_a_counter_that_went_round_before_the_recording_makes_no_difference(
+    undisturbed: tuple[Path, str],
+) -> None:
+    folder, _ = undisturbed
+    procedure = load(str(folder.parent / "short.yaml"))
+    accepted = {entry["step_id"]: entry for entry in journal(folder) if entry["event"] == "accepted"}
+    before = read_calibration(folder / "before.yaml")
+    certificates = [
+        identify(
+            procedure,
+            [
+                Attempt(
+                    step,
+                    folder / accepted[step.id]["recording"],
+                    accepted[step.id]["first_counter"] + rounds * 2**32,
+                    accepted[step.id]["last_counter"] + rounds * 2**32,
+                )
+                for step in procedure.steps
+            ],
+            Basis(before, "unit.yaml", ""),
+            BENCH,
+        ).certificate
+        for rounds in (0, 3)
+    ]
+    assert certificates[0].size_effect == certificates[1].size_effect == size_effect(folder)
+
+
+def test_killed_and_stopped_at_random_moments_it_goes_on_where_it_was_and_finds_the_same(
+    undisturbed: tuple[Path, str], tmp_path: Path
+) -> None:
+    whole, _ = undisturbed
+    folder = tmp_path / "killed"
+    lines = len(journal(whole))
+    moments = sorted(random.Random(7).sample(range(6, lines), 3))
+    for number, moment in zip((signal.SIGINT, signal.SIGKILL, signal.SIGKILL), moments, strict=True):
+        process = start(folder)
+        until(process, lambda moment=moment: len(journal(folder)) >= moment)  # type: ignore[misc]
+        process.send_signal(number)
+        out, _ = process.communicate(timeout=DEADLINE_S)
+        if number is signal.SIGINT:
+            assert process.returncode == 130
+            assert f"go on with: calib run --session {folder}" in out
+    ended(start(folder))
+    check_resumed(folder)
+    check_true(folder)
+    # The motion is carried out anew, not quite the same and under other noise: two results of equal sigma
+    # differ by less than three sigma of their difference.
+    found = size_effect(folder)
+    assert (np.abs(found.r_m - size_effect(whole).r_m) < 3.0 * 2.0**0.5 * sigma(found)).all()
+
+
+def sigma(found: SizeEffect) -> np.ndarray:
+    assert found.covariance_m2 is not None
+    return np.sqrt(np.diag(found.covariance_m2)).reshape(3, 3)
+
+
+def check_true(folder: Path) -> None:
+    """The result is as near to the truth as it says, and as near as is asked for."""
+    unit = technician(load(str(folder.parent / "short.yaml")), seed=SEED).unit.calibration
+    assert unit is not None
+    assert unit.size_effect is not None
+    found = size_effect(folder)
+    error = found.r_m - unit.size_effect.r_m
+    assert np.sqrt(np.mean(error**2)) < 0.05e-3
+    assert (np.abs(error) < 3.0 * sigma(found)).all()
+
+
+def check_resumed(folder: Path) -> None:
+    """No accepted step was asked again, no sample logged twice, all evidence is whole."""
+    done: list[str] = []
+    logged: set[str] = set()
+    for entry in journal(folder):
+        if entry["event"] == "accepted":
+            done.append(entry["step_id"])
+            assert entry["recording"] not in logged
+            logged.add(entry["recording"])
+        elif entry["event"] == "entered" and entry["phase"] in ("place", "align", "rotate"):
+            assert entry["step_id"] not in done
+    assert done == [*STEPS, "verification"]
+    assert verify(folder).faults == ()
+
+
+def test_a_session_that_is_over_is_not_begun_again(undisturbed: tuple[Path, str]) -> None:
+    folder, _ = undisturbed
+    with pytest.raises(InputError, match=r"the session is over, see report.html in it"):
+        bench.run(folder=folder, rehearse=True, console=Console())
+
+
+def test_keys_need_a_terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with open(os.devnull) as nothing:
+        monkeypatch.setattr(sys, "stdin", nothing)
+        with pytest.raises(InputError, match="expected a terminal for the operator's keys"):
+            bench.run(folder=tmp_path / "new", console=Console())
+
+
+def test_a_rehearsal_has_its_own_unit_and_a_unit_no_rehearsal(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="--rehearse: expected no --port"):
+        bench.run(folder=tmp_path / "new", rehearse=True, port="/dev/ttyUSB0", console=Console())
+    (tmp_path / JOURNAL).touch()
+    with pytest.raises(InputError, match="expected a rehearsal to go on with"):
+        bench.run(folder=tmp_path, rehearse=True, console=Console())
+
+
+def test_a_new_session_wants_the_units_papers(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="expected --port, --profile, --calibration and --site"):
+        bench.run(folder=tmp_path / "new", hands_free=True, console=Console())

@@ -1,0 +1,309 @@
+"""The worker between engine, session and operator, with samples from a queue instead of a unit."""
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from calib import conduct as conducts
+from calib.conduct import Conduct, Tap, steps_left
+from calib.console import Keys, Screen
+from calib.procedure import Procedure
+from calib.rehearsal import BENCH, Mistake, technician
+from calib.session import Document, Session, verify
+from imudrv import config, profiles
+from imudrv.calibration import coefficients, write_calibration
+from imudrv.errors import InputError
+from imudrv.imu.compensation import Compensator
+from imudrv.imu.rate_filter import rate_filter
+from imudrv.sim.scenario import NOMINAL
+from imudrv.sim.unit import simulate
+from imudrv.sinks.base import Batch
+
+LAYOUT = profiles.load("imu50-rs422").layout()
+ONE = """
+format: imu50-procedure
+version: 1
+name: one
+align_s: 30
+rest_s: 4
+poses: [{id: z-up, up: +Z, east: +X, turn_deg: 180}]
+"""
+PROCEDURE = config.parse_text(ONE.encode(), Procedure, "one.yaml")
+
+
+class Recorder:
+    """In the place of the service: a recording is a file, and closed at once."""
+
+    def __init__(self) -> None:
+        self.stopped = False
+
+    def record(self, path: Path | None) -> Future[None]:
+        done: Future[None] = Future()
+        done.set_result(None)
+        if path is not None:
+            path.write_bytes(b"recording")
+        return done
+
+    def stop(self) -> None:
+        self.stopped = True
+
+
+class Typed(Keys):
+    """Keys that are pressed once the screen asks for something."""
+
+    def __init__(self, press: Callable[[str], str] = lambda _: "") -> None:
+        super().__init__()
+        self.press = press
+        self.seen = ""
+
+    def read(self) -> str:
+        return self.press(self.seen)
+
+
+class Shown(Screen):
+    """A screen that the fingers see."""
+
+    def __init__(self, keys: Typed) -> None:
+        self.text = StringIO()
+        super().__init__(Console(file=self.text, width=200))
+        self._fingers = keys
+
+    def say(self, text: str) -> None:
+        self._fingers.seen = text
+        super().say(text)
+
+
+@pytest.fixture(scope="module")
+def batches() -> list[Batch]:
+    """A technician's samples, in pieces of a fifth of a second."""
+    compensator = Compensator(
+        coefficients(NOMINAL.model_copy(update={"size_effect": None})),
+        LAYOUT,
+        rate_filter("causal", LAYOUT.interval_ns),
+    )
+    made = []
+    for chunk in simulate(technician(PROCEDURE, calibration=NOMINAL), LAYOUT.interval_ns):
+        for begin in range(0, len(chunk.pulses), 200):
+            pulses = chunk.pulses[begin : begin + 200]
+            made.append(Batch(pulses, compensator.feed(pulses), b""))
+    return made
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> Iterator[Session]:
+    write_calibration(tmp_path / "unit.yaml", NOMINAL)
+    config.write(tmp_path / "site.yaml", BENCH)
+    session = Session.create(
+        tmp_path / "session",
+        procedure=Document("one.yaml", ONE),
+        calibration=tmp_path / "unit.yaml",
+        site=Document("site.yaml", (tmp_path / "site.yaml").read_text()),
+        profile="imu50-rs422",
+        port="nowhere",
+    )
+    yield session
+    session.close()
+
+
+def conducted(
+    session: Session,
+    items: list[Batch | str],
+    keys: Typed | None = None,
+    *,
+    hands_free: bool = True,
+    stopped: bool = True,
+) -> tuple[Conduct, str]:
+    """Work through items, behind which nothing comes; `stopped`: the service ended before they were taken."""
+    tap, recorder, keys = Tap(None), Recorder(), keys or Typed()
+    for item in items:
+        if isinstance(item, str):
+            tap.tell(item)
+        else:
+            tap.publish(item)
+    tap.close()
+    tap.is_closed = stopped
+    screen = Shown(keys)
+    conduct = Conduct(
+        session,
+        PROCEDURE,
+        LAYOUT,
+        recorder,  # type: ignore[arg-type]
+        tap,
+        screen,
+        keys,
+        hands_free=hands_free,
+        begin=lambda _: None,
+    )
+    conduct.run()
+    assert recorder.stopped
+    return conduct, screen.text.getvalue()
+
+
+def events(session: Session) -> list[str]:
+    return [entry["event"] for entry in session.entries]
+
+
+def test_a_step_is_accepted_once_its_files_are_in(session: Session, batches: list[Batch]) -> None:
+    conducted(session, list(batches))
+    (accepted,) = session.accepted.values()
+    assert accepted["recording"] == "run-z-up-1.mcap"
+    assert accepted["temperature_degc"]["gyro"] == 35.0
+    at = events(session).index("accepted")
+    assert [entry.get("name") for entry in session.entries[at - 2 : at]] == [
+        "run-z-up-1.mcap",
+        "run-z-up-1.npz",
+    ]
+    with np.load(session.folder / "run-z-up-1.npz") as log:
+        assert log["H"].shape == (len(log["counter"]), 3, 9)
+    assert events(session).index("finished") > at
+    assert verify(session.folder).faults == ()
+
+
+def test_with_an_operator_nothing_goes_on_without_a_key(session: Session, batches: list[Batch]) -> None:
+    _, text = conducted(session, list(batches), hands_free=False)
+    assert "READY: CONFIRM" in text
+    assert "align" not in text
+    assert session.accepted == {}
+
+
+def test_the_operators_key_confirms(
+    session: Session, batches: list[Batch], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(conducts, "SHOWN_S", 0.0)
+    keys = Typed(lambda seen: "\n" if "CONFIRM" in seen else "")
+    conducted(session, list(batches), keys, hands_free=False)
+    assert list(session.accepted) == ["z-up"]
+
+
+def test_an_abort_leaves_a_session_to_go_on_with(
+    session: Session, batches: list[Batch], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(conducts, "SHOWN_S", 0.0)
+    keys = Typed(lambda seen: "q" if "align" in seen else "")
+    conduct, text = conducted(session, list(batches), keys)
+    assert "q once more: abort" in text
+    assert conduct.error is None
+    assert conduct.outcome == ""
+    assert sorted(events(session)[-2:]) == ["aborted", "file"]
+    assert session.attempt("z-up") == 2
+    assert not session.is_over
+
+
+def test_what_the_service_says_of_the_port_is_shown_and_journaled(
+    session: Session, batches: list[Batch], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(conducts, "SHOWN_S", 0.0)
+    lost = "port lost: the other end has gone"
+    _, text = conducted(session, [*batches[:50], lost, *batches[50:60]])
+    assert f"! {lost}" in text
+    assert [entry["text"] for entry in session.entries if entry["event"] == "service"] == [lost]
+    assert "!" not in text.splitlines()[-1]
+
+
+def test_a_mistake_is_journaled_with_its_reasons_and_its_evidence_kept(session: Session) -> None:
+    compensator = Compensator(
+        coefficients(session.calibration()), LAYOUT, rate_filter("causal", LAYOUT.interval_ns)
+    )
+    scenario = technician(PROCEDURE, [Mistake("z-up", "short")], calibration=NOMINAL)
+    items: list[Batch | str] = [
+        Batch(chunk.pulses, compensator.feed(chunk.pulses), b"")
+        for chunk in simulate(scenario, LAYOUT.interval_ns, 500)
+    ]
+    _, text = conducted(session, items)
+    (rejected,) = (entry for entry in session.entries if entry["event"] == "rejected")
+    assert "turned 150" in rejected["reasons"][0]
+    assert "turned 150" in text
+    assert session.accepted["z-up"]["recording"] == "run-z-up-2.mcap"
+    before = session.entries[session.entries.index(rejected) - 1]
+    assert before["name"] == "run-z-up-1.mcap"  # it ends with the verdict
+    assert "run-z-up-2.mcap" in session.files
+
+
+# Resumed
+
+
+def accepted_at(session: Session, degc: float, counter: int) -> None:
+    session.append(
+        {
+            "event": "accepted",
+            "step_id": "another",
+            "counter": counter,
+            "recording": "run-another-1.mcap",
+            "temperature_degc": {"gyro": degc},
+        }
+    )
+
+
+def test_at_another_temperature_a_session_is_not_resumed(session: Session, batches: list[Batch]) -> None:
+    accepted_at(session, 20.0, 0)
+    conduct, _ = conducted(session, list(batches[:10]))
+    assert isinstance(conduct.error, InputError)
+    assert "cannot be resumed now: gyro: expected 20.0 degC within 5 K" in str(conduct.error)
+
+
+@pytest.mark.parametrize(("newest", "restarted"), [(-1, False), (10**9, True)])
+def test_a_restart_of_the_unit_between_steps_is_noted(
+    session: Session, batches: list[Batch], newest: int, restarted: bool
+) -> None:
+    accepted_at(session, 35.0, newest)
+    conducted(session, list(batches[:10]))
+    (heard,) = (entry for entry in session.entries if entry["event"] == "heard")
+    assert heard["restarted"] is restarted
+
+
+# The decision
+
+
+@pytest.fixture
+def found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A result without recordings to it."""
+
+    nothing: Any = None
+    monkeypatch.setattr(Session, "identify", lambda _: conducts.Result(nothing, NOMINAL))
+
+
+def test_a_result_that_is_turned_down_changes_nothing(
+    session: Session, batches: list[Batch], found: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = session.plan.certificate.read_bytes()
+    monkeypatch.setattr(Conduct, "_decided", lambda *_: False)
+    conduct, _ = conducted(session, list(batches), stopped=False)
+    assert "turned down" in conduct.outcome
+    assert session.is_over
+    assert session.plan.certificate.read_bytes() == before
+
+
+def test_nothing_is_decided_behind_a_ctrl_c(session: Session, batches: list[Batch], found: None) -> None:
+    before = session.plan.certificate.read_bytes()
+    conduct, _ = conducted(session, list(batches), stopped=True)
+    assert conduct.error is None
+    assert conduct.outcome == ""
+    assert "certificate.yaml" in session.files
+    assert "decision" not in events(session)
+    assert session.plan.certificate.read_bytes() == before
+
+
+def test_a_certificate_that_somebody_changed_meanwhile_is_not_overwritten(
+    session: Session, batches: list[Batch], found: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Conduct, "_decided", lambda *_: True)
+    active = session.plan.certificate
+    active.write_text(active.read_text() + "# by hand\n")
+    conduct, _ = conducted(session, list(batches), stopped=False)
+    assert isinstance(conduct.error, InputError)
+    assert "it was changed meanwhile" in str(conduct.error)
+    assert active.read_text().endswith("# by hand\n")
+
+
+def test_steps_left_are_those_not_done_with_all_that_they_had() -> None:
+    text = ONE.replace(
+        "poses: [", "poses: [{id: a, up: +X, east: +Y, turn_deg: -180, align_s: 40, repeats: 2}, "
+    )
+    procedure = config.parse_text(text.encode(), Procedure, "two.yaml")
+    assert steps_left(procedure, ["a-1"]).steps == procedure.steps[1:]

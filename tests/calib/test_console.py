@@ -1,0 +1,251 @@
+"""The bench's screen: big enough, small enough, and plain where there is no terminal."""
+
+import os
+import pty
+import sys
+import termios
+from collections.abc import Iterator
+from io import StringIO
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from calib import letters
+from calib.console import UNHEARD, Keys, Screen, plain, screen, unheard
+from calib.events import Abort, Confirm, Phase, Redo, Skip, View
+
+LONG = (
+    "gravity reads 9.203 m/s^2 where 9.792 +- 0.02 is expected: check the accelerometers' scale factors",
+    "the readings are those of a unit whose accelerometers X and Y are exchanged, or of another pose",
+)
+HEADLINES = (
+    "TURN IT: X UP",
+    "TURN IT 180 DEG COUNTER-CLOCKWISE",
+    "HANDS OFF, ALIGNING",
+    "ROTATE NOW +180",
+    "ROTATE NOW -180",
+    "FASTER",
+    "STOP",
+    "CHECK FAILED: SEE WHY",
+    "GOOD: STEP 12 OF 20 DONE",
+    "THE UNIT TELLS A FAULT",
+    UNHEARD,
+)
+
+
+def view(phase: Phase = Phase.PLACE, headline: str = "TURN IT: X UP", **changes: Any) -> View:
+    values: dict[str, Any] = {
+        "step": 2,
+        "steps": 3,
+        "step_id": "x-up",
+        "title": "step 2 of 3: X up, +180 deg",
+        "hints": (),
+        "reasons": (),
+        "angle_deg": None,
+        "want_deg": None,
+        "rate_deg_per_s": 0.0,
+        "stillness": 1.0,
+        "progress": None,
+        "remaining_s": None,
+        "level_sigma_deg": None,
+        "heading_sigma_deg": None,
+        "actions": ("confirm", "redo", "skip", "abort"),
+        "bells": 0,
+    }
+    return View(phase=phase, headline=headline, **{**values, **changes})
+
+
+def rows(shown: View, width: int = 80, height: int = 24, **options: Any) -> list[str]:
+    out = StringIO()
+    console = Console(file=out, width=width, height=height, color_system=None)
+    console.print(screen(shown, width, height, **options))
+    return out.getvalue().splitlines()
+
+
+@pytest.mark.parametrize("size", [(80, 24), (120, 40), (200, 60)])
+@pytest.mark.parametrize("headline", HEADLINES)
+def test_every_screen_fits_and_keeps_its_height(headline: str, size: tuple[int, int]) -> None:
+    full = {
+        "hints": (LONG[0], LONG[1]),
+        "reasons": (*LONG, *LONG),
+        "angle_deg": -171.25,
+        "want_deg": -180.0,
+        "rate_deg_per_s": -123.0,
+        "stillness": 0.0,
+        "progress": 0.5,
+        "remaining_s": 3599.0,
+        "level_sigma_deg": 0.0031,
+        "heading_sigma_deg": 0.0821,
+    }
+    for shown in (view(headline=headline), view(Phase.ROTATE, headline, **full)):
+        drawn = rows(shown, *size)
+        assert len(drawn) == size[1] - 1
+        assert max(map(len, drawn)) <= size[0]
+
+
+def test_the_headline_is_drawn_in_letters_at_least_three_rows_high_on_a_small_screen() -> None:
+    for headline in HEADLINES:
+        # what a screen of 80 by 24 has left beside the most that hints and reasons take
+        scale, lines = letters.fitted(headline, 78, 8)
+        assert scale >= 1
+        assert letters.rows(lines, scale) <= 8
+        assert " ".join(lines) == headline
+
+
+def test_a_letter_is_what_it_looks_like() -> None:
+    assert letters.blocks("T", 2) == ["██████", "  ██  ", "  ██  ", "  ██  ", "  ██  "]
+    assert letters.blocks("T", 1) == ["▀█▀", " █ ", " ▀ "]
+    assert letters.blocks("T", 2, ascii_only=True)[0] == "######"
+
+
+def test_bars_figures_and_reasons_are_on_the_screen() -> None:
+    text = "\n".join(
+        rows(
+            view(
+                Phase.ROTATE,
+                "FASTER",
+                angle_deg=90.0,
+                want_deg=180.0,
+                rate_deg_per_s=44.0,
+                stillness=0.0,
+                remaining_s=75.0,
+                level_sigma_deg=0.0031,
+                heading_sigma_deg=0.0821,
+                reasons=("turned 148.3 deg, want 180 +- 5",),
+            )
+        )
+    )
+    for words in (
+        "step 2 of 3: X up, +180 deg",
+        "ROTATE 1:15",
+        "+90.0 of +180 deg",
+        "44 deg/s",
+        "moves",
+        "level 0.0031 deg, heading 0.0821 deg",
+        "turned 148.3 deg, want 180 +- 5",
+        "Enter: confirm   r: redo   s: skip   q: abort",
+    ):
+        assert words in text
+    bar = next(row for row in text.splitlines() if row.startswith("angle"))
+    assert bar.count("█") == bar.count("░")
+
+
+def test_a_question_takes_the_place_of_the_keys() -> None:
+    assert rows(view(), question="once more: abort")[-1] == "once more: abort"
+
+
+def test_while_nothing_is_heard_that_is_the_headline() -> None:
+    shown = unheard(view(), "port lost: the port is gone")
+    assert plain(shown).endswith("place: NO DATA: CHECK THE CABLE | ! port lost: the port is gone")
+    assert "port lost: the port is gone" in "\n".join(rows(shown))
+
+
+def test_a_terminal_without_blocks_gets_ascii() -> None:
+    for headline in HEADLINES:
+        assert "\n".join(rows(view(headline=headline, progress=0.3), ascii_only=True)).isascii()
+
+
+def test_without_a_terminal_each_change_is_a_line() -> None:
+    out = StringIO()
+    shown = Screen(Console(file=out, width=80))
+    shown.show(view(rate_deg_per_s=20.0, hints=("roll it over",)))
+    shown.show(view(rate_deg_per_s=30.0, hints=("roll it over",), bells=1))
+    shown.show(view(Phase.VERDICT, "REJECTED: DO IT AGAIN", reasons=("turned 150.0 deg, want 180 +- 5",)))
+    shown.show(view(Phase.VERDICT, "REJECTED: DO IT AGAIN"), question="once more: abort")
+    shown.close()
+    assert out.getvalue().splitlines() == [
+        "step 2 of 3: X up, +180 deg | place: TURN IT: X UP | roll it over",
+        "step 2 of 3: X up, +180 deg | verdict: REJECTED: DO IT AGAIN | ! turned 150.0 deg, want 180 +- 5",
+        "step 2 of 3: X up, +180 deg | verdict: REJECTED: DO IT AGAIN | ! once more: abort",
+    ]
+
+
+def test_a_dumb_terminal_gets_lines_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "dumb")
+    out = StringIO()
+    Screen(Console(file=out, force_terminal=True, width=80)).show(view())
+    assert out.getvalue() == plain(view()) + "\n"
+
+
+def test_the_bell_rings_when_bells_grow(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "xterm-256color")
+    out = StringIO()
+    shown = Screen(Console(file=out, force_terminal=True, width=80, height=24))
+    for bells in (0, 1, 1, 2):
+        shown.show(view(bells=bells))
+    shown.close()
+    assert out.getvalue().count("\a") == 2
+
+
+class Terminal:
+    """A keyboard."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.master, slave = pty.openpty()
+        monkeypatch.setattr(sys, "stdin", os.fdopen(slave, "r"))
+
+    def type(self, keys: bytes) -> None:
+        os.write(self.master, keys)
+
+
+@pytest.fixture
+def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[Terminal]:
+    terminal = Terminal(monkeypatch)
+    yield terminal
+    sys.stdin.close()
+    os.close(terminal.master)
+
+
+@pytest.mark.parametrize(
+    ("key", "action"),
+    [
+        (b"\n", Confirm("x-up")),
+        (b"r", Redo("x-up")),
+        (b"S", Skip("x-up")),
+        (b"x", None),
+        (b"\x1b[A", None),
+    ],
+)
+def test_a_key_asks_for_the_step_that_is_on_the_screen(
+    terminal: Terminal, key: bytes, action: object
+) -> None:
+    with Keys() as keys:
+        assert keys.action(view()) is None
+        terminal.type(key)
+        assert keys.action(view()) == action
+
+
+def test_a_key_that_makes_no_sense_now_does_nothing(terminal: Terminal) -> None:
+    with Keys() as keys:
+        terminal.type(b"\n")
+        assert keys.action(view(actions=("skip",))) is None
+
+
+def test_q_aborts_only_when_it_comes_twice_in_a_row(terminal: Terminal) -> None:
+    with Keys() as keys:
+        terminal.type(b"q")
+        assert keys.action(view()) is None
+        assert keys.asks
+        terminal.type(b"x")
+        assert keys.action(view()) is None
+        assert not keys.asks
+        terminal.type(b"q")
+        assert keys.action(view()) is None
+        terminal.type(b"q")
+        assert keys.action(view()) == Abort()
+
+
+def test_keys_are_read_without_enter_and_the_terminal_is_given_back_as_it_was(terminal: Terminal) -> None:
+    before = termios.tcgetattr(sys.stdin.fileno())
+    with Keys():
+        assert not termios.tcgetattr(sys.stdin.fileno())[3] & termios.ICANON
+    assert termios.tcgetattr(sys.stdin.fileno()) == before
+
+
+def test_without_a_terminal_there_are_no_keys(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdin", open(os.devnull))  # noqa: SIM115
+    with Keys() as keys:
+        assert not keys.there
+        assert keys.action(view()) is None
+    sys.stdin.close()

@@ -1,0 +1,236 @@
+"""The whole procedure in virtual time: samples of the simulated unit, without a wire, through the engine."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from calib.engine import Accepted, Engine, Event, Finished, Phase, Rejected, Restarted
+from calib.identify import DIFFERENCES, Identification, joint
+from calib.procedure import Procedure, load, predicted
+from calib.rehearsal import Mistake, technician
+from calib.runs import collect
+from imudrv import Coefficients, Compensator, coefficients, load_profile, rate_filter
+from imudrv.errors import InputError
+from imudrv.records import Flag, Records
+from imudrv.sim.scenario import Scenario
+from imudrv.sim.unit import simulate
+from imudrv.units import MM
+
+LAYOUT = load_profile("imu50-rs422").layout()
+
+
+@dataclass
+class Performance:
+    """What a rehearsal gave."""
+
+    scenario: Scenario
+    procedure: Procedure
+    engine: Engine
+    samples: Records
+    events: list[Event]
+    said: list[str]
+
+    def of(self, kind: type[Event]) -> list[Event]:
+        return [event for event in self.events if isinstance(event, kind)]
+
+    @property
+    def truth(self) -> np.ndarray:
+        """The six differences, m."""
+        calibration = self.scenario.unit.calibration
+        assert calibration is not None
+        assert calibration.size_effect is not None
+        return DIFFERENCES @ calibration.size_effect.r_m.ravel()
+
+    def identified(self) -> Identification:
+        """From the samples that the accepted events name, as from a recording."""
+        calibration = self.scenario.unit.calibration
+        assert calibration is not None
+        runs = []
+        for step in self.procedure.steps:
+            accepted = self.engine.accepted[step.id]
+            counter = self.samples["counter"]
+            inside = (counter >= accepted.first_counter) & (counter <= accepted.last_counter)
+            evidence = collect(
+                lambda inside=inside: [self.samples[inside]],
+                calibration.accelerometer.C_ba_array,
+                self.scenario.site,
+                label=step.id,
+                limits=self.procedure.rotation_limits(step),
+                expected=step.up[1],
+            )
+            assert len(evidence.runs) == 1
+            assert not evidence.rejected
+            runs += evidence.runs
+        return joint(runs)
+
+
+def samples_of(scenario: Scenario) -> Records:
+    """Increments without size-effect compensation; what an unplugged cable does not carry is missing."""
+    calibration = scenario.unit.calibration
+    assert calibration is not None
+    plain: Coefficients = coefficients(calibration.model_copy(update={"size_effect": None}))
+    compensator = Compensator(plain, LAYOUT, rate_filter("centred", LAYOUT.interval_ns))
+    samples = np.concatenate([compensator.feed(c.pulses) for c in simulate(scenario, LAYOUT.interval_ns)])
+    for unplug in scenario.faults.unplugs:
+        out = (samples["t_ns"] > unplug.at_s * 1e9) & (
+            samples["t_ns"] <= (unplug.at_s + unplug.duration_s) * 1e9
+        )
+        samples = samples[~out]
+        samples["flags"][np.flatnonzero(out)[0]] |= np.uint32(Flag.MISSING_BEFORE)
+    return samples
+
+
+def perform(procedure: Procedure, mistakes: Sequence[Mistake] = (), seed: int = 1) -> Performance:
+    scenario = technician(procedure, mistakes, seed=seed)
+    samples = samples_of(scenario)
+    engine = Engine(
+        procedure, scenario.site, scenario.unit.calibration, interval_ns=LAYOUT.interval_ns, hands_free=True
+    )
+    events: list[Event] = []
+    said: list[str] = []
+    rng = np.random.default_rng(seed)
+    cuts = np.cumsum(rng.integers(1, 400, len(samples) // 100))
+    for begin, stop in pairwise([0, *cuts[cuts < len(samples)].tolist(), len(samples)]):
+        events += engine.feed(samples[begin:stop])
+        view = engine.view
+        assert len(view.headline) <= 38
+        said += [text for text in (view.headline, *view.hints) if text not in said[-8:]]
+    return Performance(scenario, procedure, engine, samples, events, said)
+
+
+def short(name: str = "three-rotations") -> Procedure:
+    """With alignments of 60 s: heading is then told to 0.3 deg, which the joint estimate bears with ease."""
+    return load(name).model_copy(update={"align_s": 60.0})
+
+
+def assert_identified(performance: Performance) -> None:
+    found = performance.identified()
+    error = found.differences.ravel() - performance.truth
+    sigma = found.differences_sigma.ravel()
+    promised = predicted(performance.procedure, performance.scenario.site).differences_sigma.ravel()
+
+    assert np.all(np.abs(error) < 3.0 * sigma), error / sigma
+    # hands turn a little slower than the plan, and the noise is that of the run
+    assert np.all(sigma < 1.25 * promised), sigma / promised
+    assert np.sqrt((error**2).mean()) < 0.08 * MM
+
+
+def test_three_rotations_by_hand_give_the_arms_as_predicted() -> None:
+    done = perform(load("three-rotations"))
+
+    assert [e.step_id for e in done.of(Accepted)] == ["z-up", "x-up", "y-up"]
+    assert not done.of(Rejected)
+    assert not done.of(Restarted)
+    assert isinstance(done.events[-1], Finished)
+    assert done.engine.view.phase is Phase.DONE
+    assert_identified(done)
+
+
+def test_the_log_has_velocity_and_H_of_every_sample_and_they_agree_with_the_true_arms() -> None:
+    done = perform(short())
+    R = done.scenario.unit.calibration.size_effect.r_m.ravel()  # type: ignore[union-attr]
+
+    assert [log.step_id for log in done.engine.runs] == ["z-up", "x-up", "y-up"]
+    for log, accepted in zip(done.engine.runs, done.of(Accepted), strict=True):
+        assert isinstance(accepted, Accepted)
+        assert np.all(np.diff(log.counter) == 1)
+        assert log.counter[-1] == log.last_counter == accepted.last_counter
+        assert log.counter[0] > log.first_counter + 60_000
+        assert len(log.counter) == len(log.t_s) == len(log.v_n) == len(log.H)
+        assert log.t_s[0] == pytest.approx(1e-3)
+        left = np.array(accepted.v_n) - log.H[log.t_s > log.t_s[-1] - 14.0].mean(axis=0) @ R
+        # 50 ug and 30 urad g for the 7 s since the alignment: 5 mm/s; the arms make 0.1 m/s
+        assert np.abs(left[:2]).max() < 0.012
+        assert np.abs(accepted.v_n[:2]).max() > 0.05
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_six_rotations_by_hand_are_better_than_three(seed: int) -> None:
+    done = perform(short("six-rotations"), seed=seed)
+
+    assert [e.step_id for e in done.of(Accepted)] == [s.id for s in done.procedure.steps]
+    assert not done.of(Restarted)
+    assert_identified(done)
+
+
+CLUMSY = {
+    "touches it, turns the wrong way, stops short": (
+        [Mistake("z-up", "moves"), Mistake("x-up", "wrong way"), Mistake("y-up", "short")],
+        [
+            ("z-up", 1, "it moved (0.06 deg/s, limit 0.05) 40 s into the alignment"),
+            ("x-up", 1, "turns the wrong way: -40 deg, want +180"),
+            ("y-up", 1, "turned 150.0 deg, want 180 +- 5"),
+        ],
+        [
+            "WRONG WAY",
+            r"turns the wrong way: -40 deg, want \+180",
+            r"TURN IT 1\d\d DEG CLOCKWISE",
+        ],
+    ),
+    "turns slowly, bumps the bench, puts the wrong side up": (
+        [Mistake("z-up", "slow"), Mistake("x-up", "bump"), Mistake("y-up", "wrong pose")],
+        [
+            ("z-up", 1, "peak 42 deg/s: slower than 70, expect 4.2 mm"),
+            ("x-up", 1, "it moved (0.58 deg/s, limit 0.05) 4.0 s into the rest, want 15"),
+        ],
+        [
+            "FASTER",
+            "peak 42 deg/s, want 70 at least",
+            "TURN IT: Y UP",
+            r"the X side is up, turn the Y side up: roll it 90 deg toward its -Y side \(north\)",
+        ],
+    ),
+    "unplugs the cable": (
+        [Mistake("x-up", "unplug")],
+        [("x-up", 1, "3000 samples missing 30 s into the alignment")],
+        [],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", list(CLUMSY))
+def test_each_mistake_is_caught_named_and_made_good(name: str) -> None:
+    mistakes, reasons, said = CLUMSY[name]
+
+    done = perform(short(), mistakes)
+
+    caught = [
+        (e.step_id, e.attempt, e.reason if isinstance(e, Restarted) else e.reasons[0])
+        for e in done.events
+        if isinstance(e, Restarted | Rejected)
+    ]
+    assert caught == reasons
+    for text in said:
+        assert any(re.fullmatch(text, said) for said in done.said), text
+    assert [e.step_id for e in done.of(Accepted)] == ["z-up", "x-up", "y-up"]
+    assert_identified(done)
+
+
+def test_a_mistake_in_a_step_that_there_is_not_is_refused() -> None:
+    with pytest.raises(InputError, match=r"different steps of z-up, x-up, y-up, got z-down"):
+        technician(short(), [Mistake("z-down", "slow")])
+
+
+def test_a_procedure_that_begins_upside_down_is_rehearsed_too() -> None:
+    plan = short()
+    pose = plan.poses[0].model_copy(update={"id": "z-down", "up": "-Z", "east": "-X"})
+    plan = plan.model_copy(update={"poses": (pose,)})
+
+    done = perform(plan)
+
+    assert [e.step_id for e in done.of(Accepted)] == ["z-down"]
+    assert not done.of(Rejected)
+
+
+def test_the_true_arms_are_drawn_in_gauge_centroid_and_the_unit_is_the_same_for_a_seed() -> None:
+    a, b, other = (technician(short(), seed=seed) for seed in (4, 4, 5))
+
+    assert a == b
+    assert a.unit.calibration != other.unit.calibration
+    assert a.unit.calibration is not None
+    assert a.unit.calibration.size_effect is not None
+    assert a.unit.calibration.size_effect.gauge == "centroid"

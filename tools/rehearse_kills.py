@@ -1,0 +1,130 @@
+"""Rehearse the bench procedure and end it with kill -9 at random moments, resuming each time.
+
+    python tools/rehearse_kills.py [--kills 30] [--seed 1] [FOLDER]
+
+At the end the session has to verify, no accepted step may have been asked again, no sample logged twice, and
+the result must be that of an undisturbed rehearsal within three sigma of their difference.
+"""
+
+import argparse
+import json
+import os
+import random
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from calib.session import verify
+from imudrv.calibration import SizeEffect, read_calibration
+from imudrv.units import MM
+
+RUN: Final = (
+    "import sys; from pathlib import Path; from rich.console import Console; from calib.bench import run; "
+    "run(folder=Path(sys.argv[1]), rehearse=True, speed='max', console=Console())"
+)
+PAUSE_S: Final = (3.0, 25.0)
+"""A process lives so long at least, for it takes a while to start, and at most."""
+
+
+def main() -> int:
+    """Run it."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("folder", type=Path, nargs="?", help="where the two sessions go")
+    parser.add_argument("--kills", type=int, default=30)
+    parser.add_argument("--seed", type=int, default=1)
+    arguments = parser.parse_args()
+    folder = arguments.folder or Path(tempfile.mkdtemp(prefix="rehearse-kills-"))
+    moments = random.Random(arguments.seed)
+
+    begun = time.monotonic()
+    rehearse(folder / "undisturbed")
+    print(f"undisturbed: {time.monotonic() - begun:.0f} s", flush=True)
+    killed, kills, sessions = folder / "killed-1", 0, 1
+    disturbed = []
+    while kills < arguments.kills:
+        lived = moments.uniform(*PAUSE_S)
+        if rehearse(killed, lived):
+            disturbed.append(killed)
+            sessions += 1
+            killed = folder / f"killed-{sessions}"
+        else:
+            kills += 1
+            lines = journal(killed)
+            print(f"kill {kills} after {lived:.1f} s: {killed.name}, {len(lines)} lines", flush=True)
+    if killed.exists():
+        rehearse(killed)
+        disturbed.append(killed)
+    faults = [fault for session in disturbed for fault in check(session, folder / "undisturbed")]
+    print("\n".join(faults) or f"{kills} kills over {len(disturbed)} sessions: all well")
+    return 1 if faults else 0
+
+
+def rehearse(folder: Path, longest_s: float | None = None) -> bool:
+    """Rehearse, or go on with it; whether it came to its end in time."""
+    with open(os.devnull) as nothing, open(f"{folder}.log", "a") as log:
+        process = subprocess.Popen(
+            [sys.executable, "-c", RUN, str(folder)], stdin=nothing, stdout=log, stderr=log
+        )
+        try:
+            process.wait(longest_s)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+            return any(entry["event"] == "end" for entry in journal(folder))
+    if process.returncode:
+        raise SystemExit(
+            f"{folder}: exit code {process.returncode}\n{Path(f'{folder}.log').read_text()[-3000:]}"
+        )
+    return True
+
+
+def check(folder: Path, undisturbed: Path) -> list[str]:
+    """What is wrong with a session that was disturbed."""
+    faults = list(verify(folder).faults)
+    done: set[str] = set()
+    for entry in journal(folder):
+        if entry["event"] == "accepted":
+            if entry["step_id"] in done:
+                faults.append(f"{folder}: {entry['step_id']} was accepted twice")
+            done.add(entry["step_id"])
+            with np.load(folder / entry["recording"].replace(".mcap", ".npz")) as log:
+                if (np.diff(log["counter"]) <= 0).any():
+                    faults.append(f"{folder}: {entry['recording']}: a sample was logged twice")
+        elif entry["event"] == "entered" and entry["phase"] == "place" and entry["step_id"] in done:
+            faults.append(f"{folder}: {entry['step_id']} was asked again")
+    found, expected = size_effect(folder), size_effect(undisturbed)
+    assert found.covariance_m2 is not None
+    sigma = np.sqrt(np.diag(found.covariance_m2)).reshape(3, 3)
+    apart = np.abs(found.r_m - expected.r_m)
+    print(f"{folder.name}: {apart.max() / MM:.4f} mm from undisturbed, {(apart / sigma).max():.2f} sigma")
+    if (apart > 3.0 * 2.0**0.5 * sigma).any():
+        faults.append(f"{folder}: the result is not that of the undisturbed session")
+    return faults
+
+
+def journal(folder: Path) -> list[dict[str, Any]]:
+    """Whole lines of a session's journal."""
+    path = folder / "journal.jsonl"
+    lines = []
+    for line in path.read_text(errors="replace").splitlines() if path.exists() else []:
+        try:
+            lines.append(json.loads(line))
+        except ValueError:
+            continue  # what a kill left
+    return lines
+
+
+def size_effect(folder: Path) -> SizeEffect:
+    """Of a session's result."""
+    found = read_calibration(folder / "certificate.yaml").size_effect
+    assert found is not None
+    return found
+
+
+if __name__ == "__main__":
+    sys.exit(main())
