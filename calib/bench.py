@@ -39,9 +39,12 @@ AHEAD: Final = 1000
 """Samples that may wait for the engine where the unit waits for its reader."""
 _PATIENCE_S: Final = 60.0
 
-# The unit ends with whoever started it, however that ends (Linux: PR_SET_PDEATHSIG, SIGTERM).
+# The unit ends with whoever started it, however that ends (Linux: PR_SET_PDEATHSIG, SIGKILL), and does not
+# begin where that has ended already.
 _UNIT: Final = (
-    "import ctypes, sys; ctypes.CDLL(None).prctl(1, 15); from imudrv.cli import main; sys.exit(main())"
+    "import ctypes, os, sys; ctypes.CDLL(None).prctl(1, 9); "
+    "os.getppid() == int(sys.argv.pop(1)) or sys.exit(); "
+    "from imudrv.cli import main; sys.exit(main())"
 )
 
 
@@ -201,7 +204,7 @@ class Rehearsal:
         config.write(scenario, technician(procedure, seed=SEED))
         command = ["sim", str(scenario), "--profile", profile, "--port", "pty", "--link", str(self._link)]
         self._unit = subprocess.Popen(
-            [sys.executable, "-c", _UNIT, *command, "--speed", self._speed],
+            [sys.executable, "-c", _UNIT, str(os.getpid()), *command, "--speed", self._speed],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             text=True,

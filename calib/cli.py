@@ -2,7 +2,8 @@
 
 import argparse
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from hashlib import sha256
 from math import inf, nan
 from pathlib import Path
@@ -26,17 +27,23 @@ from calib.certificate import (
     write_json,
 )
 from calib.dither import dither_text
+from calib.document import as_html, as_text, for_terminal
 from calib.findings import Basis, find
 from calib.gauge import GAUGES, Arms, Gauge, convert, from_kalibr, from_psins, to_kalibr, to_psins
 from calib.identify import Extra
 from calib.report import arms_text, report_for_terminal, report_html, report_text
 from calib.session import verify
+from calib.trials import TRIALS, askew, campaign, dithering
+from calib.validate import RATE_FILTER, Judged, Setting, Trial, judge, navigate
+from calib.validation_report import document
 from imudrv import config, profiles
 from imudrv.calibration import Calibration, read_calibration
+from imudrv.captures import Capture
 from imudrv.config import Model
 from imudrv.console import BAD_INPUT, OK, guarded, progress
 from imudrv.errors import InputError
 from imudrv.imu.rate_filter import NAMES, rate_filter
+from imudrv.nav.alignment import DURATION_S
 from imudrv.recording import Recording
 from imudrv.sinks.files import replacing
 from imudrv.site import Site
@@ -47,6 +54,8 @@ Stated: TypeAlias = tuple[Literal["x", "y", "z"], list[float]]
 
 EXTRAS: Final[tuple[Extra, ...]] = get_args(Extra)
 PROGRAMS: Final = ("kalibr", "psins")
+NOT_GOOD: Final = 3
+"""Exit code: a verdict is bad."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -136,6 +145,40 @@ def _parser() -> argparse.ArgumentParser:
 
     sub = add("verify", _verify, "Check a session's evidence, and find its result again from the recordings.")
     sub.add_argument("session", type=Path, metavar="DIR")
+
+    sub = add(
+        "validate",
+        _validate,
+        "Navigate the same pulses without and with compensation, and judge; exit code 3: a bad verdict.",
+    )
+    sub.add_argument(
+        "recordings", type=Path, nargs="*", metavar="RECORDING", help="rest, motion, rest; as for identify"
+    )
+    sub.add_argument(
+        "--simulate", choices=(*TRIALS, "all"), help="a simulated unit, its arms from a simulated procedure"
+    )
+    sub.add_argument("--seeds", type=int, default=1, metavar="N", help="simulated units (default: 1)")
+    sub.add_argument("--profile", metavar="P", help="as for identify")
+    sub.add_argument("--calibration", type=Path, metavar="C.yaml", help="the unit's, with lever arms")
+    sub.add_argument("--site", type=Path, metavar="S.yaml", help="where the unit stood")
+    sub.add_argument(
+        "--align",
+        type=float,
+        default=DURATION_S,
+        metavar="S",
+        help="alignment on recordings (default: %(default)g s)",
+    )
+    sub.add_argument(
+        "--rate-filter", choices=NAMES, default=RATE_FILTER, help="for the size effect (default: %(default)s)"
+    )
+    sub.add_argument(
+        "--skew-ms",
+        type=float,
+        default=0.0,
+        metavar="MS",
+        help="by so much the accelerometers' sample of recordings ends later; is put right",
+    )
+    sub.add_argument("--report", type=Path, metavar="R.html", help="the report with figures, one file")
 
     sub = add("gauge", _gauge, "A certificate's lever arms in another gauge, exactly, with their covariance.")
     sub.add_argument("file", type=Path, help="the certificate")
@@ -240,6 +283,67 @@ def _identify(arguments: argparse.Namespace) -> None:
         else:
             print(report_text(findings, told), end="")
         print(*written, sep="\n")
+
+
+def _validate(arguments: argparse.Namespace) -> int:
+    """Judge recordings, or simulated units."""
+    if (arguments.simulate is None) == (not arguments.recordings):
+        raise InputError("validate: expected either recordings or --simulate")
+    if arguments.simulate is not None:
+        trials = [(trial, judge(trial)) for trial in _simulated(arguments)]
+        shown = sum(trial.name.endswith("unit 1") for trial, _ in trials)
+        told = document("a simulated unit", trials, shown)
+        required = [judged for trial, judged in trials if "unit" in trial.name]
+    else:
+        calibration, trials = _navigated(arguments)
+        told = document(f"unit {calibration.serial_number}", trials, len(trials))
+        required = [judged for _, judged in trials]
+    if arguments.report is not None:
+        with replacing(arguments.report) as file:
+            file.write(as_html(told).encode())
+    console = Console(highlight=False)
+    if console.is_terminal:
+        console.print(for_terminal(told))
+    else:
+        print(as_text(told), end="")
+    return OK if all(judged.good for judged in required) else NOT_GOOD
+
+
+def _simulated(arguments: argparse.Namespace) -> Iterator[Trial]:
+    which, seeds, name = arguments.simulate, arguments.seeds, arguments.rate_filter
+    if seeds < 1:
+        raise InputError(f"--seeds: expected 1 or more, got {seeds}")
+    console = Console(stderr=True)
+    names = tuple(TRIALS) if which == "all" else (which,)
+    with console.status("simulate") if console.is_terminal else nullcontext() as status:
+        yield from campaign(names, range(1, seeds + 1), name, status.update if status else lambda _: None)
+        if which == "all":
+            yield from askew(1)
+            yield from dithering(1)
+
+
+def _navigated(arguments: argparse.Namespace) -> tuple[Calibration, list[tuple[Trial, Judged]]]:
+    if arguments.calibration is None or arguments.site is None:
+        raise InputError("validate: expected --calibration and --site with recordings")
+    calibration = read_calibration(arguments.calibration)
+    arms_of(calibration, str(arguments.calibration))
+    site = config.read(arguments.site, Site)
+    profile = profiles.load(arguments.profile) if arguments.profile else None
+    found = []
+    for path in arguments.recordings:
+        capture = Capture(path, profile)
+        setting = Setting(
+            capture.layout,
+            calibration,
+            site,
+            arguments.align,
+            arguments.rate_filter,
+            arguments.skew_ms * 1e-3,
+        )
+        with progress(path.name, capture.size) as advance:
+            trial = navigate(path.name, capture.pulses(advance), setting)
+        found.append((trial, judge(trial)))
+    return calibration, found
 
 
 def _written(path: Path, calibration: Calibration, arms: Arms) -> str:

@@ -211,7 +211,7 @@ def courses(t_s: Array, normal_n: Array, compensated_n: Array, moved_s: tuple[fl
             axes.plot(t_s[::step], normal_n[::step, k], color=_COLOURS[1], label="Normal")
             axes.plot(t_s[::step], compensated_n[::step, k], color=_COLOURS[0], label="Compensation")
             axes.set_ylabel(f"{name} (m/s)")
-        panels[0].legend(loc="upper left", ncols=2, fontsize=7)
+        panels[0].legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, fontsize=7)
         panels[-1].set_xlabel("time from the end of the alignment (s)")
     return canvas.svg
 

@@ -14,7 +14,7 @@ on by the gyros); its axis is that of the sum of its angles. Whether it is a rot
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from math import acos, hypot
+from math import acos, hypot, inf
 from typing import Final
 
 import numpy as np
@@ -393,6 +393,8 @@ def expected_error_mm(peak_deg_per_s: float) -> float:
     Half a turn from rest to rest of least jerk takes `T = 180 * 1.875 / peak`; it gains 8.8 / T m/s a metre,
     while 50 ug of bias and 30 urad of gyro misalignment gain `T hypot(b, g m)` m/s.
     """
+    if peak_deg_per_s <= 0.0:
+        return inf
     T = 180.0 * 1.875 / peak_deg_per_s
     return 1e3 * T * T / 8.8 * hypot(50.0 * UG, 30.0 * URAD * STANDARD_GRAVITY)
 

@@ -177,8 +177,10 @@ def trial(
     return navigate(label, _pulses(run, layout.interval_ns), setting, _pulses(_twin(run), layout.interval_ns))
 
 
-def campaign(names: Sequence[str], seeds: Sequence[int], say: Callable[[str], None]) -> Iterator[Trial]:
-    """Put units through trials; the first one also where something is not as it should be.
+def campaign(
+    names: Sequence[str], seeds: Sequence[int], filter_name: RateFilterName, say: Callable[[str], None]
+) -> Iterator[Trial]:
+    """Put units through trials.
 
     Parameters
     ----------
@@ -186,6 +188,8 @@ def campaign(names: Sequence[str], seeds: Sequence[int], say: Callable[[str], No
         Of `TRIALS`.
     seeds : sequence of int
         One a unit.
+    filter_name : str
+        Rate filter for the size effect.
     say : callable
         Told what is going on.
 
@@ -199,7 +203,7 @@ def campaign(names: Sequence[str], seeds: Sequence[int], say: Callable[[str], No
         who = subject(scenario(names[0]).unit, seed)
         for name in names:
             say(f"unit {seed}: {name}")
-            yield trial(f"{name}, unit {seed}", scenario(name), who, seed)
+            yield trial(f"{name}, unit {seed}", scenario(name), who, seed, filter_name=filter_name)
 
 
 def askew(seed: int) -> Iterator[Trial]:

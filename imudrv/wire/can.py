@@ -17,6 +17,8 @@ OPEN_SAMPLES: Final = 4
 LATE: Final = 64
 """A message up to this many samples behind the newest one is doubled; farther, the unit has restarted."""
 
+_NO_FRAMES: Final = np.zeros(0, FRAME)
+_NO_REJECTS: Final = np.zeros(0, REJECT)
 _LONGEST: Final = 64
 _ROOM: Final = _LONGEST + SLACK
 _WRONG_LENGTH: Final = int(Reason.WRONG_LENGTH)
@@ -65,7 +67,7 @@ class CanAssembler:
         self._low = np.zeros(OPEN_SAMPLES, np.int64)
         self._index = np.zeros((OPEN_SAMPLES, len(kinds)), np.int64)
         self._data = np.zeros((OPEN_SAMPLES, len(kinds), _ROOM), np.uint8)
-        self._held = np.zeros(0, FRAME)
+        self._held = _NO_FRAMES
         self._latest = np.zeros(1, FRAME)
         self._state = np.zeros(9, np.int64)
         _forget(self._state, self._latest, self._tables.hold)
@@ -124,8 +126,10 @@ class CanAssembler:
             held,
             rejects,
         )
-        self._held = frames[released:found].copy()
-        return Decoded(frames[:released], rejects[:rejected].view(REJECT)[:, 0])
+        # Copies and views of nothing would take a quarter of a live call.
+        self._held = frames[released:found].copy() if released < found else _NO_FRAMES
+        refused = rejects[:rejected].view(REJECT)[:, 0] if rejected else _NO_REJECTS
+        return Decoded(frames[:released], refused)
 
     def close(self) -> Decoded:
         """End of the messages: held samples come out, incomplete ones as rejects."""
