@@ -1,6 +1,6 @@
 """The stages in a row, as live samples and recorded ones take them: decode, account, stamp, compensate."""
 
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from imudrv.imu.clock import ClockModel
 from imudrv.imu.compensation import Coefficients, Compensator
 from imudrv.imu.rate_filter import RateFilter
 from imudrv.profiles import Profile
-from imudrv.records import Flag, Records
+from imudrv.records import INCREMENTS, PULSES, Flag, Records
 from imudrv.wire.decoder import FrameDecoder
 
 
@@ -26,6 +26,9 @@ class Sampled(NamedTuple):
 
     pulses: Records
     increments: Records
+
+
+_NOTHING: Final = Sampled(np.zeros(0, PULSES), np.zeros(0, INCREMENTS))
 
 
 class Pipeline:
@@ -96,9 +99,11 @@ class Pipeline:
         return self._next is not None
 
     def _through(self, frames: Records) -> Sampled:
+        if not len(frames):
+            return _NOTHING
         pulses = self.accountant.feed(frames)
         if not len(pulses):
-            return Sampled(pulses, self._compensator.feed(pulses))
+            return Sampled(pulses, _NOTHING.increments)
         self.clock.feed(pulses)
         increments = self._compensator.feed(pulses)
         if self._next is not None:
