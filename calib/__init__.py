@@ -16,8 +16,8 @@ The flow, one way; every module can be read alone::
 The bench procedure, with a technician::
 
     procedure  what is to be done, as data         rehearsal  a simulated technician who does it
-    engine     the state machine: samples and keys in, events and a view out; motion, preflight and prompts are
-               its senses, its first look and its words, events what it says
+    engine     the state machine: samples and keys in, events and a view out. motion is its senses, preflight
+               its first look, prompts its words, events what it says
     console    the view on a terminal (letters: large ones)
     session    the evidence of a session: journal, recordings, result; resume and verify
     conduct    engine, session and screen together, beside the service      bench  `calib run`
