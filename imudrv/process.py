@@ -51,14 +51,18 @@ def ask_realtime() -> str | None:
 
 
 class Signals:
-    """SIGTERM and SIGINT end the loop, SIGHUP makes it read the calibration again; seen at its next turn."""
+    """SIGTERM and SIGINT end the loop, SIGHUP makes it read the calibration again; seen at its next turn.
+
+    A SIGHUP because the terminal has gone ends it too: nobody is there any more.
+    """
 
     def __init__(self) -> None:
         self.stop = False
         self.reload = False
+        self._has_terminal = os.isatty(0)
 
     def _handle(self, number: int, _: object) -> None:
-        if number == signal.SIGHUP:
+        if number == signal.SIGHUP and os.isatty(0) == self._has_terminal:
             self.reload = True
         else:
             self.stop = True

@@ -95,11 +95,12 @@ class Unit:
 class Service:
     """A running `imudrv run`."""
 
-    def __init__(self, folder: Path, *arguments: object) -> None:
+    def __init__(self, folder: Path, *arguments: object, stdin: int = subprocess.DEVNULL) -> None:
         self.socket = folder / "status.sock"
         self.process = subprocess.Popen(
             [sys.executable, "-m", "imudrv", "run", *map(str, arguments), "--status", str(self.socket)],
             cwd=folder,
+            stdin=stdin,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -132,8 +133,8 @@ class Service:
 
 
 @contextmanager
-def serving(folder: Path, *arguments: object) -> Iterator[Service]:
-    service = Service(folder, *arguments)
+def serving(folder: Path, *arguments: object, stdin: int = subprocess.DEVNULL) -> Iterator[Service]:
+    service = Service(folder, *arguments, stdin=stdin)
     try:
         yield service
     finally:
@@ -249,6 +250,18 @@ def test_a_calibration_is_exchanged_while_running_and_a_bad_one_is_refused(folde
     pulses = np.rint(100.0 * np.sin(np.arange(400) / 50.0))
     scale = increments["dtheta_b"][:, 0][np.abs(pulses) > 0] / pulses[np.abs(pulses) > 0]
     assert np.unique(np.round(scale / scale[0], 9)).tolist() == [1.0, 2.0]
+
+
+def test_it_ends_when_its_terminal_has_gone(folder: Path) -> None:
+    unit = Unit(folder / "unit")
+    master, slave = pty.openpty()
+    with serving(folder, *serial(folder), stdin=slave) as service:
+        os.close(slave)
+        unit.send(100)
+        until(lambda: service.good() == 100, "the samples")
+        os.close(master)
+        assert service.stop(signal.SIGHUP) == 0
+        assert service.heard("100 good")
 
 
 def test_a_calibration_of_another_unit_is_refused_at_the_start(folder: Path) -> None:
