@@ -2,7 +2,7 @@
 
 import argparse
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from hashlib import sha256
 from math import inf, nan
@@ -40,7 +40,7 @@ from imudrv import config, profiles
 from imudrv.calibration import Calibration, read_calibration
 from imudrv.captures import Capture
 from imudrv.config import Model
-from imudrv.console import BAD_INPUT, OK, guarded, progress
+from imudrv.console import BAD_INPUT, OK, CommandLine, progress
 from imudrv.errors import InputError
 from imudrv.imu.rate_filter import NAMES, rate_filter
 from imudrv.nav.alignment import DURATION_S
@@ -49,7 +49,6 @@ from imudrv.sinks.files import replacing
 from imudrv.site import Site
 from imudrv.units import MM, NS, NS_PER_S
 
-Command: TypeAlias = Callable[[argparse.Namespace], int | None]
 Stated: TypeAlias = tuple[Literal["x", "y", "z"], list[float]]
 
 EXTRAS: Final[tuple[Extra, ...]] = get_args(Extra)
@@ -71,21 +70,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     int
         Exit code, see `imudrv.console`.
     """
-    arguments = _parser().parse_args(argv)
-    command: Command = arguments.command
-    return guarded(lambda: command(arguments))
+    return _commands().run(argv)
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="calib", description="Inner lever arms of a 50-type ring-laser-gyro IMU."
-    )
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-
-    def add(name: str, command: Command, text: str) -> argparse.ArgumentParser:
-        sub = commands.add_parser(name, help=text, description=text)
-        sub.set_defaults(command=command)
-        return sub
+def _commands() -> CommandLine:
+    line = CommandLine("calib", "Inner lever arms of a 50-type ring-laser-gyro IMU.")
+    add = line.add
 
     def add_gauge(sub: argparse.ArgumentParser, option: str, **more: Any) -> None:
         sub.add_argument(option, dest="gauge", choices=GAUGES, help="where the origin of b is put", **more)
@@ -220,7 +210,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="PART",
         help="the case's angle over the block's; default: 0.01",
     )
-    return parser
+    return line
 
 
 def _run(arguments: argparse.Namespace) -> int:

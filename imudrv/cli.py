@@ -2,9 +2,8 @@
 
 import argparse
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TypeAlias
 
 from rich.console import Console
 
@@ -12,7 +11,7 @@ from imudrv import config, profiles, settings
 from imudrv.calibration import Calibration, coefficients, read_calibration, require_unit
 from imudrv.captures import Capture
 from imudrv.config import Model
-from imudrv.console import BAD_INPUT, OK, guarded, progress
+from imudrv.console import BAD_INPUT, OK, CommandLine, progress
 from imudrv.demo import demo
 from imudrv.doctor import doctor
 from imudrv.errors import InputError
@@ -32,8 +31,6 @@ from imudrv.sinks.files import increment_columns, pulse_columns, replacing, tabl
 from imudrv.site import Site
 from imudrv.status import EXIT_CODES, ask
 
-Command: TypeAlias = Callable[[argparse.Namespace], int | None]
-
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line.
@@ -48,19 +45,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     int
         Exit code, see `imudrv.console`.
     """
-    arguments = _parser().parse_args(argv)
-    command: Command = arguments.command
-    return guarded(lambda: command(arguments))
+    return _commands().run(argv)
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="imudrv", description="Driver of a 50-type ring-laser-gyro IMU.")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-
-    def add(name: str, command: Command, text: str) -> argparse.ArgumentParser:
-        sub = commands.add_parser(name, help=text, description=text)
-        sub.set_defaults(command=command)
-        return sub
+def _commands() -> CommandLine:
+    line = CommandLine("imudrv", "Driver of a 50-type ring-laser-gyro IMU.")
+    add = line.add
 
     def add_profile(sub: argparse.ArgumentParser, required: bool = False) -> None:
         text = f"{', '.join(profiles.shipped())}, or a profile file"
@@ -151,7 +141,7 @@ def _parser() -> argparse.ArgumentParser:
         lambda _: demo(_say),
         "The whole story on a simulated unit: bench procedure, certificate, proof.",
     )
-    return parser
+    return line
 
 
 def _decode(arguments: argparse.Namespace) -> None:

@@ -1,11 +1,13 @@
 """What every command shares: errors in plain words, exit codes, and a progress bar where somebody looks."""
 
+import argparse
 import os
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import TypeAlias
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
@@ -15,6 +17,35 @@ from imudrv.errors import InputError
 OK, OUR_FAULT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 """Exit codes."""
 _PATIENCE_S = 1.0
+
+
+Command: TypeAlias = Callable[[argparse.Namespace], int | None]
+
+
+class CommandLine:
+    """A program with commands, each a function of its arguments.
+
+    Parameters
+    ----------
+    program, description : str
+        As help tells them.
+    """
+
+    def __init__(self, program: str, description: str) -> None:
+        self._parser = argparse.ArgumentParser(prog=program, description=description)
+        self._commands = self._parser.add_subparsers(required=True, metavar="COMMAND")
+
+    def add(self, name: str, command: Command, text: str) -> argparse.ArgumentParser:
+        """Add a command; gives the parser that its arguments are added to."""
+        parser = self._commands.add_parser(name, help=text, description=text)
+        parser.set_defaults(command=command)
+        return parser
+
+    def run(self, argv: Sequence[str] | None) -> int:
+        """Run the command that the arguments name, those of the process if None; gives the exit code."""
+        arguments = self._parser.parse_args(argv)
+        command: Command = arguments.command
+        return guarded(lambda: command(arguments))
 
 
 def guarded(command: Callable[[], int | None]) -> int:

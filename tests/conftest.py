@@ -7,9 +7,9 @@ _DATA = Path(__file__).parents[2] / "shared" / "data"
 
 @pytest.fixture(scope="session")
 def data() -> Path:
-    """The folder of captures that a developer's machine has beside the project."""
+    """The folder of captures that may lie beside the project; they are not part of it."""
     if not _DATA.is_dir():
-        pytest.skip(f"needs the captures in {_DATA}, which come with the project's workplace only")
+        pytest.skip("needs the captures in ../shared/data beside the project, absent here")
     return _DATA
 
 

@@ -14,8 +14,6 @@ from imudrv.config import kind, parse, read, write
 from imudrv.errors import FaultyFileError, InputError
 from imudrv.site import Site
 
-REFERENCE = Path(__file__).parents[2] / "shared" / "data" / "reference"
-
 # The example of the files' specification.
 EXAMPLE = """\
 format: imu50-calibration
@@ -367,13 +365,12 @@ def test_a_written_certificate_keeps_the_one_before(tmp_path: Path) -> None:
     assert read_calibration(tmp_path / "cal.yaml").serial_number == "50-0018"
 
 
-@pytest.mark.skipif(not REFERENCE.is_dir(), reason="the supplied reference data are not beside the project")
-def test_the_supplied_calibration_and_site_read() -> None:
-    reference = read_calibration(REFERENCE / "calibration.yaml", unit="50-0017")
-    assert reference.gyro.scale_arcsec_per_pulse[0] == 0.44611747767685633
-    assert reference.size_effect is None
-    assert read(REFERENCE / "site.yaml", Site).gravity_m_s2 == 9.791866064825728
-    assert kind(REFERENCE / "site.yaml") == "imu50-site"
+def test_the_supplied_calibration_and_site_read(reference: Path) -> None:
+    supplied = read_calibration(reference / "calibration.yaml", unit="50-0017")
+    assert supplied.gyro.scale_arcsec_per_pulse[0] == 0.44611747767685633
+    assert supplied.size_effect is None
+    assert read(reference / "site.yaml", Site).gravity_m_s2 == 9.791866064825728
+    assert kind(reference / "site.yaml") == "imu50-site"
 
 
 # Site

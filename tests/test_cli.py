@@ -209,11 +209,8 @@ def test_ctrl_c_leaves_no_half_file(bench: Path) -> None:
     assert not list(bench.glob("*long.raw*"))
 
 
-@pytest.mark.skipif(
-    not (ROOT.parent / "shared" / "data").is_dir(), reason="needs the captures in ../shared/data, absent here"
-)
-def test_real_laser_gyro_pulses_come_through_the_wire_as_they_are(tmp_path: Path) -> None:
-    source = ROOT.parent / "shared" / "data" / "lasergyro.imu"
+def test_real_laser_gyro_pulses_come_through_the_wire_as_they_are(data: Path, tmp_path: Path) -> None:
+    source = data / "lasergyro.imu"
     tool = [sys.executable, str(ROOT / "tools" / "psins_to_wire.py"), str(source), "-o", "real.raw"]
     subprocess.run(tool, cwd=tmp_path, check=True, timeout=300)
     done = imudrv(
