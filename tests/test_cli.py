@@ -200,7 +200,7 @@ def test_ctrl_c_leaves_no_half_file(bench: Path) -> None:
         start_new_session=True,
     )
     deadline = time.monotonic() + 120
-    # In the middle: an interrupt while kernels are loaded may end in a callback of the compiler, which drops it.
+    # In the middle: while kernels are loaded an interrupt may end in a callback of the compiler, and be lost.
     while not any(half.stat().st_size for half in bench.glob(".long.raw.*")):
         assert process.poll() is None
         assert time.monotonic() < deadline
