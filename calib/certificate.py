@@ -52,15 +52,11 @@ def certificate(findings: Findings, arms: Arms) -> Calibration:
     Raises
     ------
     InputError
-        The data contradict the model: nothing is certified that rests on them.
+        The result is one that nothing may be certified on, see `Identification.refusals`.
     """
     result = findings.result
-    if findings.contradicted:
-        raise InputError(
-            f"no certificate: expected chi-square of about {result.degrees_of_freedom}, got "
-            f"{result.chi_square:.0f}: the velocities contradict the model; the report's figures show which "
-            "rotation stands out: leave it out, or look for what moved"
-        )
+    if result.refusals:
+        raise InputError(f"no certificate: {'; '.join(result.refusals)}")
     found = {"method": result.method, **_made_of(findings), **_outcome(result)}
     return with_arms(findings.basis.calibration, arms, FOUND, found, findings.created)
 
@@ -243,6 +239,7 @@ def result_document(findings: Findings, arms: Arms) -> dict[str, Any]:
                 "V_n_m_s": told.V_n.tolist(),
                 "H_n_m_s_per_m": told.H.tolist(),
                 "V_n_minus_H_R_m_s": told.compensated_n.tolist(),
+                "H_rest_m_s_per_m": told.H_rest,
                 "t_s": told.t_s.tolist(),
                 "v_n_m_s": told.v_n.tolist(),
                 "fitted_n_m_s": told.fitted_n.tolist(),

@@ -134,11 +134,6 @@ class Findings:
         return correlation
 
     @property
-    def contradicted(self) -> bool:
-        """Whether the data contradict the model."""
-        return self.result.degrees_of_freedom > 0 and not self.result.consistent
-
-    @property
     def runs(self) -> tuple[Run, ...]:
         """The runs, in the order of `result.runs`."""
         return tuple(run for source in self.sources for run in source.evidence.runs)

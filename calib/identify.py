@@ -45,7 +45,7 @@ from imudrv.records import INCREMENTS
 from imudrv.units import DEG, MM, NS, STANDARD_GRAVITY, UG
 
 Array = NDArray[np.float64]
-Extra = Literal["skew", "quadratic"]
+Extra = Literal["quadratic"]
 
 ROWS_A_BIN: Final = round(BIN_S / (BLOCK_NS * NS))
 """Rows at rest that make one equation."""
@@ -55,6 +55,8 @@ TOLD_S: Final = 0.5
 """`plain` takes the mean velocity over so long after the rotation, s."""
 CHI_SQUARE_LIMIT: Final = 2.0
 """Chi-square per degree of freedom from which data contradict the model."""
+REST_H_LIMIT: Final = 2e-3
+"""H at the end of a rest, m/s per m, above which the gyros' increments are not those of a unit at rest."""
 PIVOT_LIMIT: Final = 10.0
 """Chi-square that a pivot of each rotation's own may explain, for each of its components."""
 PIVOT_SIGMA: Final = 0.1
@@ -151,6 +153,9 @@ class RunResult:
         The same of the measurement matrix.
     compensated_n : ndarray, shape (3,)
         `V_n - H R`.
+    H_rest : float
+        Largest horizontal element of H at the end of the rest before, m/s per m: 0 in theory. Dither or
+        vibration left in the gyros' increments is rectified by the squared rates and makes it grow.
     t_s : ndarray, shape (n,)
         Middle of each bin at rest, from the start of navigation.
     v_n, fitted_n : ndarray, shape (n, 2)
@@ -163,6 +168,7 @@ class RunResult:
     V_n: Array
     H: Array
     compensated_n: Array
+    H_rest: float
     t_s: Array
     v_n: Array
     fitted_n: Array
@@ -271,6 +277,27 @@ class Identification:
         """Whether chi-square is one that the model allows; without degrees of freedom nothing can differ."""
         return self.chi_square <= CHI_SQUARE_LIMIT * self.degrees_of_freedom or not self.degrees_of_freedom
 
+    @property
+    def refusals(self) -> tuple[str, ...]:
+        """Why no certificate may be made of the result, with what to do; empty: one may."""
+        refusals = []
+        if not self.consistent:
+            refusals.append(
+                f"the velocities contradict the model: expected chi-square of about "
+                f"{self.degrees_of_freedom}, got {self.chi_square:.0f}; the report's figures show which "
+                "rotation stands out: leave it out, or look for what moved"
+            )
+        worst = max(self.runs, key=lambda run: run.H_rest)
+        if worst.H_rest > REST_H_LIMIT:
+            refusals.append(
+                "the gyro increments carry dither or vibration: expected H of at most "
+                f"{REST_H_LIMIT:g} m/s per m at the end of the rest before the rotation, got "
+                f"{worst.H_rest:.2g} ({worst.label}); the squared rates rectify it and the arms come out "
+                "wrong: let the unit remove its dither from the increments, or stop what shakes the bench, "
+                "and record again"
+            )
+        return tuple(refusals)
+
 
 @dataclass(frozen=True)
 class Planned:
@@ -286,12 +313,15 @@ class Planned:
         From rest to rest, with least jerk.
     after_s : float
         Rest after it.
+    offset_m : float
+        Distance of the origin of b from the axis of the rotation, through which a skew acts.
     """
 
     up: str
     angle_deg: float = 180.0
     duration_s: float = 2.5
     after_s: float = 15.0
+    offset_m: float = 0.05
 
 
 @dataclass(frozen=True)
@@ -331,10 +361,9 @@ def joint(
         then known during the motion too, and R is told from that origin.
     nine : bool
         All nine components are wanted, which needs a known pivot.
-    extra : sequence of {'skew', 'quadratic'}
-        More unknowns: by how much the accelerometers' sample ends later than the gyros', s, and a quadratic
-        term on each sensing axis, 1/(m/s^2). Those that the data do not tell are kept at their prior, and a
-        note says so.
+    extra : sequence of {'quadratic'}
+        More unknowns: a quadratic term on each sensing axis, 1/(m/s^2). Those that are not observable stay
+        at their prior, and a note says so.
 
     Returns
     -------
@@ -347,6 +376,7 @@ def joint(
         that the data contradict.
     """
     priors = priors or Priors()
+    terms = _terms(priors, extra)
     _some(runs)
     if nine and pivot == "free":
         raise InputError(
@@ -355,7 +385,7 @@ def joint(
             "or turn the unit about a pivot that stays still and say so (pivot fixed)"
         )
     noise = _noise(runs)
-    system = _System([_equations(run, noise, pivot, extra) for run in runs], _priors(runs, priors, extra))
+    system = _System([_equations(run, noise, pivot, terms) for run in runs], _priors(runs, priors, terms))
     basis = np.eye(9) if pivot == "fixed" else SHIFT_FREE
     sigma, directions = system.directions()
     rank = int((sigma < priors.arm).sum())
@@ -428,11 +458,12 @@ def plain(runs: Sequence[Run], priors: Priors | None = None) -> Identification:
     priors = priors or Priors()
     _some(runs)
     noise = _noise(runs)
-    unknowns = _priors(runs, priors, ())
+    terms = _terms(priors, ())
+    unknowns = _priors(runs, priors, terms)
     told = [_told(run) for run in runs]
     V = np.concatenate([v[:2] for v, _ in told])
     H = np.concatenate([h[:2] for _, h in told])
-    S = _plain_covariance(runs, noise, unknowns)
+    S = _plain_covariance(runs, noise, unknowns, terms)
     sigma_v = float(np.sqrt(np.trace(S) / len(S)))
     singular = _singular_values(told)
     s, directions = np.zeros(9), np.linalg.svd(H)[2]
@@ -499,7 +530,8 @@ def predict(
     if not plan:
         raise InputError("plan: expected one rotation at least, got none")
     runs = [_ideal(planned, k, latitude_rad, priors) for k, planned in enumerate(plan)]
-    system = _System([_equations(run, noise, "free", ()) for run in runs], _priors(runs, priors, ()))
+    terms = _terms(priors, ())
+    system = _System([_equations(run, noise, "free", terms) for run in runs], _priors(runs, priors, terms))
     sigma, directions = system.directions()
     if int((sigma < priors.arm).sum()) < 6:
         raise InputError(_unseen(sigma, directions, SHIFT_FREE, priors.arm))
@@ -610,14 +642,16 @@ def _ideal(planned: Planned, k: int, latitude_rad: float, priors: Priors) -> Run
     angle = planned.angle_deg * DEG * u**3 * (10.0 - 15.0 * u + 6.0 * u * u)
     gravity = normal_gravity(latitude_rad, 0.0)
     C_nb0 = Attitude.align_vectors([[0.0, 0.0, 1.0]], [up_b])[0]
-    C_nb = Attitude.from_rotvec(np.outer(angle, [0.0, 0.0, 1.0])) * C_nb0
+    turned = Attitude.from_rotvec(np.outer(angle, [0.0, 0.0, 1.0]))
+    C_nb = turned * C_nb0
     increments = np.zeros(len(angle) - 1, INCREMENTS)
     increments["counter"] = np.arange(len(increments))
     increments["interval_ns"] = _PLAN_INTERVAL_NS
     increments["dtheta_b"] = np.outer(np.diff(angle), up_b) + T * C_nb[1:].inv().apply(
         earth_rate_n(latitude_rad)
     )
-    increments["dv_b"] = gravity * T * up_b
+    v_n = np.gradient(turned.apply([planned.offset_m, 0.0, 0.0]), T, axis=0)
+    increments["dv_b"] = gravity * T * up_b + C_nb[1:].inv().apply(np.diff(v_n, axis=0))
     q_nb = np.roll(C_nb0.as_quat(), 1)
     navigator = Navigator(
         latitude_rad, 0.0, 0.0, None, q_nb, C_ba=np.eye(3), every=BLOCK_NS // _PLAN_INTERVAL_NS
@@ -653,7 +687,12 @@ def _some(runs: Sequence[Run]) -> None:
         )
 
 
-def _priors(runs: Sequence[Run], priors: Priors, extra: Sequence[Extra]) -> Unknowns:
+def _terms(priors: Priors, extra: Sequence[Extra]) -> tuple[str, ...]:
+    """Terms beside biases and matrices: skew, unless it is known to be none, and what is asked for."""
+    return (*(("skew",) if priors.skew else ()), *extra)
+
+
+def _priors(runs: Sequence[Run], priors: Priors, terms: Sequence[str]) -> Unknowns:
     off = ~np.eye(3, dtype=bool)
     accelerometer = np.where(off, priors.accelerometer_misalignment, priors.accelerometer_scale)
     gyro = np.where(off, priors.gyro_misalignment, priors.gyro_scale)
@@ -664,9 +703,9 @@ def _priors(runs: Sequence[Run], priors: Priors, extra: Sequence[Extra]) -> Unkn
         ("gyro_bias", "xyz", np.full(3, priors.gyro_bias)),
         ("gyro_matrix", entries, gyro.ravel()),
     ]
-    if "skew" in extra:
+    if "skew" in terms:
         groups.append(("skew", ("s",), np.array([priors.skew])))
-    if "quadratic" in extra:
+    if "quadratic" in terms:
         groups.append(("quadratic", "xyz", np.full(3, priors.quadratic)))
     shared = sum(len(sigma) for _, _, sigma in groups)
     groups += [
@@ -712,7 +751,7 @@ def _covariance(t: Array, single: Array, noise: Noise, gravity: float) -> Array:
     return np.asarray(K, np.float64)
 
 
-def _columns(run: Run, extra: Sequence[Extra]) -> Array:
+def _columns(run: Run, terms: Sequence[str]) -> Array:
     """What each row's velocity owes to R, to what is shared, and to phi_0: (n, 3, 9 + shared + 3)."""
     rows, t = run.rows, run.t_s
     C_nb = Attitude.from_quat(np.roll(rows["q_nb"], -1, axis=1)).as_matrix()
@@ -734,9 +773,9 @@ def _columns(run: Run, extra: Sequence[Extra]) -> Array:
         _tilted(-integral_of_B, run.gravity),
         _tilted(-rows["Q"], run.gravity),
     ]
-    if "skew" in extra:
+    if "skew" in terms:
         parts.append(_skew_column(run, C_nb, f_n, f_b))
-    if "quadratic" in extra:
+    if "quadratic" in terms:
         parts.append(np.cumsum(dB * (f_b * f_b)[:, None, :], axis=0))
     return np.concatenate([*parts, _tilted(integral_of_phi, run.gravity)], axis=2)
 
@@ -778,13 +817,13 @@ def _tilted(phi: Array, gravity: float) -> Array:
     return out
 
 
-def _equations(run: Run, noise: Noise, pivot: str, extra: Sequence[Extra]) -> _Part:
+def _equations(run: Run, noise: Noise, pivot: str, terms: Sequence[str]) -> _Part:
     """Bins of the rests; with a known pivot points of the motion, and the vertical, too."""
     parts = 3 if pivot == "fixed" else 2
     rows = [_bins(run.before, True), _bins(run.after, False)]
     if pivot == "fixed":
         rows.insert(1, np.flatnonzero(~(run.before | run.after))[::ROWS_A_POINT, None])
-    columns = _columns(run, extra)[:, :parts]
+    columns = _columns(run, terms)[:, :parts]
 
     def mean(x: Array) -> Array:
         return np.concatenate([x[at].mean(axis=1) for at in rows])
@@ -822,7 +861,7 @@ def _told_rows(run: Run) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return np.flatnonzero(run.before)[-n:], np.flatnonzero(run.after)[:n]
 
 
-def _plain_covariance(runs: Sequence[Run], noise: Noise, unknowns: Unknowns) -> Array:
+def _plain_covariance(runs: Sequence[Run], noise: Noise, unknowns: Unknowns, terms: Sequence[str]) -> Array:
     """Covariance of the stacked velocities of `_told`, from priors and noise.
 
     The alignment has chosen tilt and heading so that the rest before shows no acceleration: what is not known
@@ -834,7 +873,7 @@ def _plain_covariance(runs: Sequence[Run], noise: Noise, unknowns: Unknowns) -> 
     for k, run in enumerate(runs):
         at = unknowns.columns_of(k, len(runs))
         still = _bins(run.before, True)
-        columns = _columns(run, ())[:, :2]
+        columns = _columns(run, terms)[:, :2]
         A, t = columns[still].mean(axis=1), run.t_s[still].mean(axis=1)
         single = [_bin_variance(rest, noise) for rest in (run.rotation.before, run.rotation.after)]
         K = _covariance(t, np.full(len(t), single[0]), noise, run.gravity)
@@ -865,6 +904,7 @@ def _at_rest(run: Run, R: Array) -> tuple[Array, Array, Array]:
 
 def _run_result(run: Run, V: Array, H: Array, R: Array, t_s: Array, v_n: Array, fitted_n: Array) -> RunResult:
     rotation = run.rotation
+    H_rest = run.rows["H"][_told_rows(run)[0], :2].mean(axis=0)
     return RunResult(
         run.label,
         rotation.axis,
@@ -872,6 +912,7 @@ def _run_result(run: Run, V: Array, H: Array, R: Array, t_s: Array, v_n: Array, 
         V,
         H,
         V - H @ R,
+        float(np.abs(H_rest).max()),
         t_s,
         v_n[:, :2],
         fitted_n[:, :2],

@@ -42,7 +42,7 @@ class Priors:
     gyro_bias, gyro_scale, gyro_misalignment : float
         rad/s, 1, rad, each axis.
     skew : float
-        By how much the accelerometers' sample may end later than the gyros', s.
+        By how much the accelerometers' sample may end later than the gyros', s; 0: known to be none.
     quadratic : float
         Quadratic term of an accelerometer, 1/(m/s^2).
     arm : float
@@ -55,7 +55,7 @@ class Priors:
     gyro_bias: float = 0.01 * DEG_PER_H
     gyro_scale: float = 5.0 * PPM
     gyro_misalignment: float = 30.0 * URAD
-    skew: float = 5e-3
+    skew: float = 0.5e-3
     quadratic: float = 50.0 * UG / STANDARD_GRAVITY**2
     arm: float = 3.0 * MM
 

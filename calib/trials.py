@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from calib.certificate import FOUND, with_arms
 from calib.gauge import Arms
-from calib.identify import Extra, Identification, joint
+from calib.identify import Identification, joint
 from calib.runs import Run, collect
 from calib.segments import Limits
 from calib.validate import RATE_FILTER, Setting, Trial, navigate
@@ -55,7 +55,7 @@ class Subject:
     result : Identification
         The estimate.
     skew_s : float
-        Of the accelerometers' samples, as estimated; 0: not estimated.
+        Of the accelerometers' samples, as estimated.
     """
 
     real: Calibration
@@ -64,9 +64,7 @@ class Subject:
     skew_s: float
 
 
-def subject(
-    unit: Unit, seed: int, *, extra: Sequence[Extra] = (), procedure: Sequence[str] = PROCEDURE
-) -> Subject:
+def subject(unit: Unit, seed: int, *, procedure: Sequence[str] = PROCEDURE) -> Subject:
     """Draw a unit and run the procedure with it.
 
     Parameters
@@ -75,8 +73,6 @@ def subject(
         Calibration, and errors that it is drawn from.
     seed : int
         Decides the unit, and the noise of every run.
-    extra : sequence of str
-        More unknowns, see `calib.identify.joint`.
     procedure : sequence of str
         Scenarios, the shipped ones' names; each motion in them serves.
 
@@ -88,8 +84,8 @@ def subject(
     real = really(unit, seed)
     built = unit.model_copy(update={"calibration": real, "residuals": Residuals()})
     runs = [run for k, name in enumerate(procedure) for run in _evidence(name, built, [seed, k], came_with)]
-    result = joint(runs, extra=extra)
-    skew_s = next((n.value for n in result.nuisances if n.name == "skew_s"), 0.0)
+    result = joint(runs)
+    skew_s = next(n.value for n in result.nuisances if n.name == "skew_s")
     arms = Arms(result.R_b, result.covariance, result.gauge)
     return Subject(real, with_arms(came_with, arms, FOUND, {"method": result.method}), result, skew_s)
 
@@ -224,7 +220,7 @@ def askew(seed: int) -> Iterator[Trial]:
     rocking = scenario("rocking")
     unit = rocking.unit.model_copy(update={"accelerometer_skew_s": SKEW_S})
     rocking = rocking.model_copy(update={"unit": unit})
-    who = subject(unit, seed, extra=("skew",), procedure=(*PROCEDURE, TRIALS["rocking"]))
+    who = subject(unit, seed, procedure=(*PROCEDURE, TRIALS["rocking"]))
     late = f"{SKEW_S * 1e3:g} ms"
     yield trial(f"rocking, {late} skew ignored", rocking, who, seed)
     label = f"rocking, {late} skew estimated as {who.skew_s * 1e3:.2f} ms"

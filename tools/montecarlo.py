@@ -12,7 +12,7 @@ A longer alignment would cost time and change little: the rests beside the rotat
 import argparse
 import json
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -54,7 +54,7 @@ class Budget:
     turn_s: float = 2.5
     axis_tilt_mrad: float = 3.0  # of the rotation's axis from the vertical, in a random direction
     pivot_mm: float = 60.0  # of the origin of b from the axis' fixed point, each component up to this
-    priors: Priors = field(default_factory=Priors)
+    priors: Priors = field(default_factory=Priors)  # the unit's skew is drawn from its prior
 
 
 BUDGETS = {
@@ -123,6 +123,7 @@ def scenario(seed: int, calibration: Calibration, pose: str, sign: int, budget: 
     tilt, pivot = bench.uniform(-TILT_MRAD, TILT_MRAD, 2), bench.uniform(-1.0, 1.0, 3) * budget.pivot_mm
     lean = bench.uniform(0.0, 2.0 * np.pi)
     axis_tilt = [budget.axis_tilt_mrad * np.cos(lean), budget.axis_tilt_mrad * np.sin(lean)]
+    skew_s = budget.priors.skew * float(np.random.default_rng([seed, 7]).standard_normal())
     document: dict[str, Any] = {
         "format": "imu50-scenario",
         "version": 1,
@@ -136,6 +137,7 @@ def scenario(seed: int, calibration: Calibration, pose: str, sign: int, budget: 
         ],
         "unit": {
             "calibration": json.loads(calibration.model_dump_json(exclude_none=True)),
+            "accelerometer_skew_s": skew_s,
             "noise": {"arw_deg_per_sqrt_h": budget.arw_deg_per_sqrt_h, "vrw_m_s_per_sqrt_h": 0.003},
         },
     }
@@ -244,16 +246,26 @@ def main() -> None:
     parser.add_argument("--cases", type=int, default=200, help="how many (default: %(default)s)")
     parser.add_argument("--budget", choices=BUDGETS, default="standard", help="default: %(default)s")
     parser.add_argument("--signs", choices=("one", "both"), default="one", help="three rotations or six")
+    parser.add_argument(
+        "--skew-sigma-ms",
+        type=float,
+        default=Priors().skew * 1e3,
+        help="gyro-accelerometer skew of the units, 1 sigma, and its prior; 0: none (default: %(default)s)",
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the first case (default: %(default)s)")
     parser.add_argument("--json", action="store_true", help="numbers for a machine instead of a table")
     options = parser.parse_args()
     if options.cases < 1:
         parser.error("--cases: expected 1 or more")
+    if not 0.0 <= options.skew_sigma_ms <= 2.0:
+        parser.error("--skew-sigma-ms: expected 0 to 2")
+    budget = BUDGETS[options.budget]
+    budget = replace(budget, priors=replace(budget.priors, skew=options.skew_sigma_ms * 1e-3))
     seeds: Iterable[int] = range(options.seed, options.seed + options.cases)
     if not options.json:
         seeds = track(seeds, description="cases", transient=True)
     signs = (1,) if options.signs == "one" else (1, -1)
-    found = montecarlo(seeds, signs, BUDGETS[options.budget])
+    found = montecarlo(seeds, signs, budget)
     if options.json:
         rows = [asdict(row) for row in found]
         print(json.dumps({"budget": options.budget, "signs": options.signs, "methods": rows}, indent=1))

@@ -43,6 +43,7 @@ def findings(**changes: object) -> Findings:
         V_n=np.array([0.2, -0.1, 0.0]),
         H=np.zeros((3, 9)),
         compensated_n=np.zeros(3),
+        H_rest=1e-4,
         t_s=np.arange(4.0),
         v_n=np.full((4, 2), 1e-3),
         fitted_n=np.full((4, 2), 0.5e-3),
@@ -121,7 +122,15 @@ def test_the_certificate_keeps_the_static_calibration_and_says_how_the_arms_were
 
 def test_nothing_is_certified_that_the_data_contradict() -> None:
     found = findings(chi_square=250.0)
-    with pytest.raises(InputError, match=r"no certificate: expected chi-square of about 100, got 250"):
+    with pytest.raises(InputError, match=r"no certificate: .*expected chi-square of about 100, got 250"):
+        certificate(found, found.arms)
+
+
+def test_nothing_is_certified_on_increments_that_carry_dither() -> None:
+    found = findings()
+    shaken = replace(found.result.runs[0], H_rest=0.07)  # three arcsec of dither do this in ten seconds
+    found = replace(found, result=replace(found.result, runs=(shaken,)))
+    with pytest.raises(InputError, match=r"no certificate: the gyro increments carry dither.*0\.07 \(z#1\)"):
         certificate(found, found.arms)
 
 

@@ -22,6 +22,7 @@ from imudrv.errors import InputError
 from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import rate_filter
 from imudrv.records import INCREMENTS, Records
+from imudrv.sim.scenario import Dither
 from imudrv.site import Site
 from imudrv.units import DEG, DEG_PER_H, MM, PPM, STANDARD_GRAVITY, UG, URAD
 
@@ -91,8 +92,9 @@ def test_joint_finds_the_arms_of_the_reference_captures(captured: tuple[list[Run
     found = joint(runs)
     assert rms_mm(found, truth) < 0.05  # the requirement; the predicted sigma is 0.012
     assert found.rank == 6
-    assert found.reason.startswith("rank 6: the directions seen have a sigma of 0.01")
-    assert found.direction_sigma[5] < 0.03 * MM
+    # one direction is that in which a skew of the size of its prior acts, the unit 0.1 m off the axis
+    assert found.reason.startswith("rank 6: the directions seen have a sigma of 0.1")
+    assert found.direction_sigma[4] < 0.03 * MM
     assert found.direction_sigma[6] > 1.0
     error = found.differences.ravel() - DIFFERENCES @ truth.ravel()
     assert error @ np.linalg.solve(found.differences_covariance, error) < chi2.ppf(0.999, 6)
@@ -198,12 +200,15 @@ def test_correlations_are_correlations(simulated: tuple[list[Run], Array]) -> No
 # --- accuracy, and whether it is what is said ---
 
 
-@pytest.mark.parametrize(("signs", "limit_mm"), [((1,), 0.03), ((1, -1), 0.015)])
+@pytest.mark.parametrize(
+    ("signs", "skew_s", "limit_mm"), [((1,), 0.0, 0.03), ((1,), 0.5e-3, 0.05), ((1, -1), 0.5e-3, 0.015)]
+)
 def test_many_units_are_found_as_well_as_predicted(
-    montecarlo: ModuleType, signs: tuple[int, ...], limit_mm: float
+    montecarlo: ModuleType, signs: tuple[int, ...], skew_s: float, limit_mm: float
 ) -> None:
     cases = 12 if len(signs) == 1 else 8
-    of_joint, of_plain = montecarlo.montecarlo(range(100, 100 + cases), signs, montecarlo.BUDGETS["standard"])
+    budget = replace(montecarlo.BUDGETS["standard"], priors=Priors(skew=skew_s))
+    of_joint, of_plain = montecarlo.montecarlo(range(100, 100 + cases), signs, budget)
     assert of_joint.mean_rms_mm < limit_mm  # the requirement
     assert of_plain.mean_rms_mm > 5.0 * of_joint.mean_rms_mm
     for found in (of_joint, of_plain):
@@ -228,6 +233,51 @@ def test_a_harder_budget_widens_the_prediction_with_the_error(montecarlo: Module
     assert found.predicted_mm > least_mm
 
 
+@pytest.mark.parametrize(("signs", "sigmas"), [((1,), 4.0), ((1, -1), 3.0)])
+def test_a_skew_of_one_sample_is_within_the_uncertainty(
+    montecarlo: ModuleType, monkeypatch: pytest.MonkeyPatch, signs: tuple[int, ...], sigmas: float
+) -> None:
+    scenario = montecarlo.scenario
+
+    def skewed(*arguments: Any) -> Any:
+        made = scenario(*arguments)
+        return made.model_copy(update={"unit": made.unit.model_copy(update={"accelerometer_skew_s": 1e-3})})
+
+    monkeypatch.setattr(montecarlo, "scenario", skewed)
+    worst = {0.0: 0.0, Priors().skew: 0.0}
+    for seed in range(400, 404):
+        runs, truth = montecarlo.case(seed, signs, montecarlo.BUDGETS["standard"])
+        for skew in worst:
+            found = joint(runs, Priors(skew=skew))
+            error = found.differences.ravel() - DIFFERENCES @ truth.ravel()
+            worst[skew] = max(worst[skew], float(np.abs(error / found.differences_sigma.ravel()).max()))
+    # twice the prior's sigma: three rotations do not determine the skew, six do
+    assert worst[Priors().skew] < sigmas
+    assert worst[0.0] > sigmas  # as it was without the parameter
+
+
+def test_dither_left_in_the_increments_is_refused(montecarlo: ModuleType, simulated: Any) -> None:
+    assert joint(simulated[0]).refusals == ()
+    assert max(run.H_rest for run in joint(simulated[0]).runs) < 5e-4  # a quarter of the limit
+    budget = montecarlo.BUDGETS["standard"]
+    nominal = montecarlo.scenario
+
+    def shaken(*arguments: Any) -> Any:
+        made = nominal(*arguments)
+        dither = Dither(
+            amplitude_arcsec=(3.0, 3.0, 3.0), frequency_hz=(380.0, 400.0, 420.0), in_increments=1.0
+        )
+        unit = made.unit.model_copy(update={"dither": dither})
+        return made.model_copy(update={"unit": unit})
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(montecarlo, "scenario", shaken)
+        runs, _ = montecarlo.case(3, (1,), budget)
+    for found in (joint(runs), plain(runs)):
+        assert len(found.refusals) == 1
+        assert found.refusals[0].startswith("the gyro increments carry dither or vibration")
+
+
 # --- before any data ---
 
 
@@ -243,10 +293,14 @@ def test_slower_rotations_and_fewer_predict_more() -> None:
     noise = Noise(6e-7, 5e-5, 5e-6, 1.4e-4)
     three = predict(THREE, LATITUDE, noise).differences_sigma
     assert (predict(BOTH, LATITUDE, noise).differences_sigma < 0.8 * three).all()
-    slow = predict([replace(planned, duration_s=4.0) for planned in THREE], LATITUDE, noise)
+    known = Priors(skew=0.0)  # what a skew does falls as 1 / T too
+    slow = predict([replace(planned, duration_s=4.0) for planned in THREE], LATITUDE, noise, known)
+    three = predict(THREE, LATITUDE, noise, known).differences_sigma
     # velocity a metre falls as 1 / T, what drifts meanwhile grows
     assert (slow.differences_sigma > 1.6 * three).all()
-    other_way_up = predict([replace(planned, up=f"-{planned.up[1]}") for planned in THREE], LATITUDE, noise)
+    other_way_up = predict(
+        [replace(planned, up=f"-{planned.up[1]}") for planned in THREE], LATITUDE, noise, known
+    )
     np.testing.assert_allclose(np.sort(other_way_up.differences_sigma, None), np.sort(three, None), rtol=0.02)
 
 
@@ -331,7 +385,7 @@ def test_a_skew_is_seen_with_a_known_pivot(montecarlo: ModuleType, monkeypatch: 
 
     monkeypatch.setattr(montecarlo, "scenario", skewed)
     runs, truth = montecarlo.case(3, (1,), replace(montecarlo.BUDGETS["standard"], pivot_mm=0.0))
-    found = joint(runs, pivot="fixed", extra=("skew",))
+    found = joint(runs, Priors(skew=5e-3), pivot="fixed")
     skew = next(n for n in found.nuisances if n.name == "skew_s")
     assert skew.seen
     assert skew.value == pytest.approx(3e-3, abs=4.0 * skew.sigma)
@@ -369,7 +423,7 @@ def test_a_turntable_run_gives_all_nine_with_every_other_error(positions: Record
     site = Site(latitude_deg=34.0, longitude_deg=0.0, height_m=0.0)
     runs = collect(lambda: [positions], np.eye(3), site, limits=limits, priors=priors).runs
     assert len(runs) == 18
-    found = joint(runs, priors, pivot="fixed", nine=True, extra=("skew", "quadratic"))
+    found = joint(runs, priors, pivot="fixed", nine=True, extra=("quadratic",))
     truth = -np.array([[10.0, 20.0, 30.0], [40.0, 50.0, 60.0], [0.0, 0.0, 0.0]]) * MM
     assert found.rank == 9
     assert found.notes == ()

@@ -114,8 +114,9 @@ def assert_identified(performance: Performance) -> None:
     promised = predicted(performance.procedure, performance.scenario.site).differences_sigma.ravel()
 
     assert np.all(np.abs(error) < 3.0 * sigma), error / sigma
-    # hands turn a little slower than the plan, and the noise is that of the run
-    assert np.all(sigma < 1.25 * promised), sigma / promised
+    # hands turn a little slower than the plan, the noise is that of the run; a skew acts along where the unit
+    # stands from the axis, which no plan knows, so that the sum is compared and not each difference
+    assert np.linalg.norm(sigma) < 1.25 * np.linalg.norm(promised), sigma / promised
     assert np.sqrt((error**2).mean()) < 0.08 * MM
 
 

@@ -169,7 +169,7 @@ def test_a_skew_is_estimated_with_a_rocking_and_put_right() -> None:
     made = short("rocking")
     unit = made.unit.model_copy(update={"accelerometer_skew_s": 1e-3})
     made = made.model_copy(update={"unit": unit})
-    who = subject(unit, 2, extra=("skew",), procedure=(*trials.PROCEDURE, "rocking"))
+    who = subject(unit, 2, procedure=(*trials.PROCEDURE, "rocking"))
     (skew,) = (n for n in who.result.nuisances if n.name == "skew_s")
     assert skew.seen
     assert skew.value == pytest.approx(1e-3, abs=3.0 * skew.sigma)
