@@ -1,9 +1,10 @@
 """Evidence: for every rotation that serves, velocity and its matrices over rest, rotation and rest.
 
 Each rotation is a run of its own: aligned on the rest before it but for its last seconds, then navigated from
-zero velocity through the end of that rest, the rotation, and the rest after. A capture is read twice: the
-first pass finds the segments, the second aligns and navigates as the increments come by, so that memory stays
-that of a chunk and of the rows kept.
+zero velocity through the end of that rest, the rotation, and the rest after, with the dither of the gyro
+blocks filtered from the angle increments. A capture is read twice: the first pass finds the segments, the
+second aligns and navigates as the increments come by, so that memory stays that of a chunk and of the rows
+kept.
 """
 
 from collections.abc import Callable, Iterable
@@ -13,6 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from calib.low_pass import without_dither
 from calib.segments import BLOCK_NS, Limits, Rotation, Segments, find_segments, judge
 from imudrv.nav.alignment import DURATION_S, SHORTEST_S, Aligned, Alignment
 from imudrv.nav.earth import normal_gravity
@@ -155,7 +157,7 @@ def collect(
         The capture is too short, or a rest cannot be aligned on.
     """
     limits, priors = limits or Limits(), priors or Priors()
-    segments = find_segments(read())
+    segments = find_segments(without_dither(read()))
     verdicts = [(rotation, judge(rotation, limits, expected)) for rotation in segments.rotations]
     good = [rotation for rotation, reasons in verdicts if not reasons]
     open_runs = [
@@ -163,7 +165,7 @@ def collect(
         for k, rotation in enumerate(good)
     ]
     if open_runs:
-        for piece in read():
+        for piece in without_dither(read()):
             for run in open_runs:
                 run.feed(piece)
     return Evidence(

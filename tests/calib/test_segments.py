@@ -214,3 +214,18 @@ def test_too_little_data_are_refused(bench: Bench, step: Step) -> None:
 def test_limits_can_be_others(bench: Bench, step: Step) -> None:
     rotation = only(find_segments([bench(step(20.0), step(1.5, 90.0), step(8.0))]))
     assert judge(rotation, replace(LIMITS, angle_deg=90.0, rest_before_s=15.0)) == ()
+
+
+@pytest.mark.parametrize("samples", [1, 2, 5, 9])
+def test_a_short_last_block_is_no_motion(bench: Bench, step: Step, samples: int) -> None:
+    rows = bench(step(20.0), step(2.5, 180.0), step(20.0))[: 20_000 + samples]  # blocks of ten samples
+    rows["dtheta_b"][-1] += 1e-5  # a pulse of two arcsec alone in a few samples
+    found = find_segments([rows])
+    assert len(found.rotations) == 1
+    assert found.rests[-1].stop - found.first == 20_000
+
+
+def test_no_error_is_extrapolated_for_what_is_no_turn(bench: Bench, step: Step) -> None:
+    found = only(find_segments([bench(step(20.0), step(2.0, 9.0), step(20.0))]))
+    assert found.peak_deg_per_s < 10.0
+    assert "peak 8 deg/s: slower than 70" in judge(found, LIMITS)
