@@ -247,7 +247,12 @@ def _conducted(
         unit=plan.unit,
         status=str(Path(tempfile.gettempdir()) / f"imu50-calib-{os.getpid()}.sock"),
     )
-    service = Service(settings, lambda text: tap.tell(text.partition(" ")[2]), [tap])
+    service = Service(
+        settings,
+        lambda text: tap.tell(text.partition(" ")[2]),
+        [tap],
+        in_real_time=rehearsal is None,
+    )
 
     def begin(steps: Procedure) -> None:
         if rehearsal is not None:

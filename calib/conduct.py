@@ -19,7 +19,7 @@ from typing import Final
 import numpy as np
 
 from calib.certificate import write
-from calib.console import Keys, Screen, unheard
+from calib.console import Keys, Screen, with_port_state
 from calib.engine import Engine
 from calib.events import (
     Aborted,
@@ -168,7 +168,6 @@ class Conduct:
         self._backlog: deque[Batch] = deque()
         self._closing: deque[tuple[Future[None], Callable[[], None]]] = deque()
         self._recording = ""
-        self._trouble = ""
         self._conditions = Conditions()
         self._told_ns = 0
 
@@ -259,9 +258,8 @@ class Conduct:
             self._file_closed()
             if events or is_due:
                 shown, shown_s = engine.view, time.monotonic()
-                if self._trouble:
-                    shown = unheard(shown, self._trouble)
-                self._screen.show(shown, ABORT if self._keys.asks else "")
+                drawn = with_port_state(shown, self._service.port_state)
+                self._screen.show(drawn, ABORT if self._keys.asks else "")
         self._end_recording()
         while self._closing:
             if batch := self._take():
@@ -279,13 +277,10 @@ class Conduct:
         except Empty:
             return None
         if isinstance(item, Batch):
-            self._trouble = ""
             return item
         if item is None:
             self._file_all()
             raise _StoppedError
-        if item.startswith(("port ", "the unit ")):
-            self._trouble = item
         self._journal({"event": "service", "text": item})
         return None
 

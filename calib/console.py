@@ -21,9 +21,12 @@ from rich.text import Text
 
 from calib import letters
 from calib.events import Abort, Action, Confirm, Phase, Redo, Skip, View
+from imudrv.diagnosis import LineState
 
 UNHEARD: Final = "NO DATA: CHECK THE CABLE"
 """Headline while nothing comes from the unit."""
+UNREADABLE: Final = "NO FRAMES: CHECK THE PROFILE"
+"""Headline while what comes is not what the profile says."""
 _OTHER_ROWS: Final = 8
 """Rows beside headline, hints and reasons; one is left free, for a terminal that scrolls behind the last."""
 _FEWEST: Final = 2
@@ -46,21 +49,26 @@ _STYLES: Final = {
 }
 
 
-def unheard(view: View, why: str) -> View:
-    """A view while nothing comes from the unit: that has to be mended first.
+def with_port_state(view: View, state: LineState) -> View:
+    """Add what is wrong with the line to a view; without samples that is the headline.
 
     Parameters
     ----------
     view : View
-        Of the engine.
-    why : str
-        What the service says.
+        From the engine.
+    state : LineState
+        From the service.
 
     Returns
     -------
     View
+        The same if nothing is wrong.
     """
-    return replace(view, headline=UNHEARD, reasons=(why, *view.reasons))
+    if not state.trouble:
+        return view
+    headlines = {"streaming": view.headline, "unreadable": UNREADABLE}
+    headline = headlines.get(state.name, UNHEARD)
+    return replace(view, headline=headline, reasons=(str(state), *view.reasons))
 
 
 def screen(
@@ -228,7 +236,7 @@ def _time(seconds: float | None) -> str:
 
 def _banner(view: View, width: int, height: int, ascii_only: bool) -> RenderableType:
     refused = view.reasons and view.phase in (Phase.PREFLIGHT, Phase.PLACE, Phase.VERDICT)
-    style = "white on red" if refused or view.headline == UNHEARD else _STYLES[view.phase]
+    style = "white on red" if refused or view.headline in (UNHEARD, UNREADABLE) else _STYLES[view.phase]
     inside = width - 2
     scale, lines = letters.fitted(view.headline, inside, height)
     if ascii_only and scale < 2:

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -225,7 +226,7 @@ def _play(arguments: argparse.Namespace) -> None:
 def _run(arguments: argparse.Namespace) -> None:
     names = set(Settings.model_fields) - {"format", "version"}
     given = {name: getattr(arguments, name) for name in names}
-    Service(settings.load(arguments.settings, given), _say).run()
+    Service(settings.load(arguments.settings, given), _say, warn=_warn).run()
 
 
 def _monitor(arguments: argparse.Namespace) -> None:
@@ -258,6 +259,10 @@ def _export(arguments: argparse.Namespace) -> None:
 
 def _say(text: str) -> None:
     print(text, flush=True)
+
+
+def _warn(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
 
 
 def _check(arguments: argparse.Namespace) -> None:

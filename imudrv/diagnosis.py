@@ -1,19 +1,31 @@
-"""What a stretch of a line's data says: does a profile fit, how well, and which would fit better. No I/O."""
+"""What the data of a line says about it, without I/O.
 
+Of a stretch: whether a profile fits, how well, and which would fit better. While it flows: whether anything
+comes, whether samples come of it, and at what rate.
+"""
+
+from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from imudrv.imu.accounting import Account, Accountant
 from imudrv.profiles import Profile, SerialLine
 from imudrv.records import Reason, Records
-from imudrv.units import NS
+from imudrv.units import NS, NS_PER_S
 from imudrv.wire.decoder import FrameDecoder
 
 FEW: Final = 3
 """Good frames by chance are fewer than this."""
+SILENCE_NS: Final = 4 * NS_PER_S // 10
+"""A line that brings nothing for this long, and two samples more, is silent."""
+UNREADABLE_NS: Final = NS_PER_S
+"""Data that gives no sample for this long, and as long as samples may be held back, is not the profile's."""
+RATE_TOLERANCE: Final = 0.09
+"""Largest relative error of a right rate: a stall of 250 ms changes one measured over 3 s by less."""
+_RATE_SECONDS: Final = 3
 _IDLE_BITS: Final = 3
 _STUFFING: Final = 1.2
 
@@ -128,6 +140,143 @@ def best(candidates: Iterable[Profile], data: bytes | Records) -> Profile | None
             if found is None or read > found[0]:
                 found = read, profile
     return found[1] if found else None
+
+
+class LineState(NamedTuple):
+    """State of the line to the unit.
+
+    Parameters
+    ----------
+    name : str
+        ``connecting``, ``streaming``, ``silent``, ``unreadable``, ``lost`` or ``ended``.
+    trouble : str
+        What is wrong and what to do; empty if nothing is.
+    """
+
+    name: str
+    trouble: str = ""
+
+    def __str__(self) -> str:
+        """One line for people."""
+        return self.trouble if self.name == "streaming" else f"port {self.name}: {self.trouble}"
+
+
+class LineWatch:
+    """Judges an open line by what it brings; all times are of one monotonic clock, ns.
+
+    A silent or unreadable line is streaming again with its next sample, not with its next byte. A wrong rate
+    is reported after three seconds that all deviate in the same direction, and withdrawn after three that
+    are all right: a stall, a burst of old frames or a leap of the counter changes neither.
+
+    Parameters
+    ----------
+    profile : Profile
+        What the unit should send.
+    in_real_time : bool
+        Whether the unit sends at its own pace; otherwise its rate is not judged.
+    t_ns : int
+        When the line was opened.
+    """
+
+    def __init__(self, profile: Profile, in_real_time: bool, t_ns: int) -> None:
+        self._profile = profile
+        self._in_real_time = in_real_time
+        interval_ns = round(NS_PER_S / profile.sample_rate_hz)
+        held = 2 * max(message.every for message in profile.messages)  # on CAN, for their full counter
+        self._silence_ns = SILENCE_NS + 2 * interval_ns
+        self._unreadable_ns = UNREADABLE_NS + held * interval_ns
+        self._state = LineState("streaming")
+        self._arrived_ns = t_ns
+        self._undecoded = 0  # bytes or messages since the last sample; the first of them came at:
+        self._undecoded_ns = t_ns
+        self._counted: tuple[int, int] | None = None
+        self._rates: deque[float] = deque(maxlen=_RATE_SECONDS)
+
+    def arrived(self, amount: int, samples: int, t_ns: int) -> None:
+        """Take note of an arrival.
+
+        Parameters
+        ----------
+        amount : int
+            Bytes or messages; more than none.
+        samples : int
+            Samples that they completed.
+        t_ns : int
+            Time now.
+        """
+        self._arrived_ns = t_ns
+        if samples:
+            self._undecoded = 0
+            if self._state.name != "streaming":
+                self._enter(LineState("streaming"))
+            return
+        if not self._undecoded:
+            self._undecoded_ns = t_ns
+        self._undecoded += amount
+
+    def counted(self, expected: int, t_ns: int) -> None:
+        """Judge the rate; call it about once a second.
+
+        Parameters
+        ----------
+        expected : int
+            Samples by the unit's counter, see `imudrv.imu.accounting.Account`.
+        t_ns : int
+            Time now.
+        """
+        if not self._in_real_time or self._state.name != "streaming":
+            return
+        if self._counted is not None:
+            before, since_ns = self._counted
+            self._rates.append((expected - before) / ((t_ns - since_ns) * NS))
+        self._counted = expected, t_ns
+        if len(self._rates) < _RATE_SECONDS:
+            return
+        nominal = self._profile.sample_rate_hz
+        slack = RATE_TOLERANCE * nominal + 1.0 / _RATE_SECONDS  # the ends may fall between two samples
+        least, most = nominal - slack, nominal + slack
+        if least <= min(self._rates) and max(self._rates) <= most:
+            self._state = LineState("streaming")
+        elif not self._state.trouble and (max(self._rates) < least or min(self._rates) > most):
+            rate = sum(self._rates) / _RATE_SECONDS
+            trouble = (
+                f"expected {nominal:g} samples/s of {self._profile.name}, the unit counts {rate:.1f}: "
+                "set sample_rate_hz in the profile, or the rate in the unit"
+            )
+            self._state = LineState("streaming", trouble)
+
+    def state(self, t_ns: int) -> LineState:
+        """Return the state of the line.
+
+        Parameters
+        ----------
+        t_ns : int
+            Time now.
+
+        Returns
+        -------
+        LineState
+            ``streaming``, ``silent`` or ``unreadable``; the text of a trouble stays the same while it lasts.
+        """
+        if t_ns - self._arrived_ns > self._silence_ns:
+            self._undecoded = 0
+            self._enter(LineState("silent", f"nothing for {self._silence_ns * NS:.1f} s"))
+        elif self._undecoded and self._state.name != "unreadable":
+            span_ns = t_ns - self._undecoded_ns
+            if span_ns > self._unreadable_ns:
+                what = "bytes" if self._profile.transport == "serial" else "messages"
+                trouble = (
+                    f"{self._undecoded} {what} in {span_ns * NS:.1f} s, and no frame of {self._profile.name} "
+                    "in them that gives a sample: check the profile and the line settings, or stop this and "
+                    "run `imudrv doctor` on the port"
+                )
+                self._enter(LineState("unreadable", trouble))
+        return self._state
+
+    def _enter(self, state: LineState) -> None:
+        self._state = state
+        self._counted = None
+        self._rates.clear()
 
 
 def line_load(profile: Profile) -> float:

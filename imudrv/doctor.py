@@ -38,7 +38,6 @@ _AFTER_SILENCE: Final = {
 _DISCARD_S: Final = 0.1
 _MOST: Final = 1 << 24
 _HEAVY: Final = 0.9
-_RATE_TOLERANCE: Final = 0.1  # a stalled machine shifts an edge of the stretch by 130 ms
 _LOW_LATENCY: Final = 1 << 13  # ASYNC_LOW_LATENCY, linux/tty_flags.h
 _IFF_UP: Final = 1
 
@@ -454,7 +453,7 @@ def judge(profile: Profile, heard: diagnosis.Heard, span_s: float, in_real_time:
             "counter", Verdict.WARN, f"it jumped back {account.restarts} times", "does the unit's power hold?"
         )
     rate = diagnosis.rate(heard, span_s)
-    if in_real_time and abs(rate / profile.sample_rate_hz - 1.0) > _RATE_TOLERANCE:
+    if in_real_time and abs(rate / profile.sample_rate_hz - 1.0) > diagnosis.RATE_TOLERANCE:
         yield Step(
             "rate",
             Verdict.FAIL,

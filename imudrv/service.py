@@ -22,6 +22,7 @@ import numpy as np
 
 from imudrv import config, profiles
 from imudrv.calibration import Calibration, coefficients, read_calibration
+from imudrv.diagnosis import LineState, LineWatch
 from imudrv.errors import InputError
 from imudrv.hostclock import now_ns
 from imudrv.imu.rate_filter import rate_filter
@@ -42,8 +43,6 @@ from imudrv.wire.encode import CanEncoder, StreamEncoder
 
 POLL_NS: Final = NS_PER_S // 50
 """Time between two rounds of housekeeping, and the longest wait for data."""
-SILENCE_NS: Final = 4 * NS_PER_S // 10
-"""A port that has brought nothing for so long is silent."""
 BACK_OFF_S: Final = (0.1, 0.2, 0.4, 0.8)
 """Waits between attempts to open a port again; the last one for ever."""
 _WARM_UP: Final = 300
@@ -61,6 +60,10 @@ class Service:
         Told each event in a line.
     sinks : sequence of Sink
         More ways out than the settings have.
+    warn : callable, optional
+        Called instead of `say` with each event that is a failure.
+    in_real_time : bool
+        False for a simulated unit at a port, whose rate depends on its speed and is not judged.
 
     Raises
     ------
@@ -68,9 +71,17 @@ class Service:
         Something in the settings cannot be: all that can be told before the unit is there is told now.
     """
 
-    def __init__(self, settings: Settings, say: Callable[[str], None], sinks: Sequence[Sink] = ()) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        say: Callable[[str], None],
+        sinks: Sequence[Sink] = (),
+        *,
+        warn: Callable[[str], None] | None = None,
+        in_real_time: bool = True,
+    ) -> None:
         self._settings = settings
-        self._say = say
+        self._say, self._warn = say, warn or say
         self._profile = profiles.load(settings.profile)
         self._layout = self._profile.layout()
         self._calibration_path = Path(settings.calibration)
@@ -89,11 +100,12 @@ class Service:
         self._notices: list[str] = []
         self._events: list[str] = []
         self._port: Port | None = None
-        self._port_state, self._trouble, self._reconnects = "connecting", "", 0
+        self._port_state, self._reconnects = LineState("connecting"), 0
         scheme = settings.port.partition(":")[0]
         self._source = {"sim": Source.SIMULATOR, "replay": Source.REPLAY}.get(scheme, Source.HARDWARE)
+        self._in_real_time = in_real_time and self._source is Source.HARDWARE
         self._began_ns = now_ns()
-        self._heard_ns = self._began_ns
+        self._watch = LineWatch(self._profile, self._in_real_time, self._began_ns)
         self._samples = self._samples_told = self._lost_told = 0
         self._told_ns = self._began_ns
         self._is_news = False
@@ -120,7 +132,7 @@ class Service:
         """Serve until SIGTERM, Ctrl-C, or the end of a replay."""
         if self._settings.realtime and (refusal := ask_realtime()):
             self._notices.append(refusal)
-            self._event(refusal)
+            self._failure(refusal)
         warm_up(self._profile, self._calibration, self._settings)
         with self._signals.caught(), quiet_memory():
             try:
@@ -135,6 +147,11 @@ class Service:
     def stop(self) -> None:
         """End `run`, as SIGTERM does; for any thread."""
         self._signals.stop = True
+
+    @property
+    def port_state(self) -> LineState:
+        """State of the line to the unit; for any thread."""
+        return self._port_state
 
     def record(self, path: Path | None) -> Future[None]:
         """Record into another file, or into none; for any thread.
@@ -174,14 +191,15 @@ class Service:
                     self._lose(str(lost))
                     attempt, next_attempt_ns = 0, 0
                 except PortEndedError:
-                    self._port_state = "ended"
+                    self._port_state = LineState("ended")
                     return
                 else:
                     if len(arrival.data):
-                        self._heard_ns = now_ns()
                         if self._recorder is not None:
                             self._recorder.arrived(arrival)
-                        self._publish(self._pipeline.feed(arrival.data, arrival.t_ns), arrival.t_ns)
+                        sampled = self._pipeline.feed(arrival.data, arrival.t_ns)
+                        self._publish(sampled, arrival.t_ns)
+                        self._watch.arrived(len(arrival.data), len(sampled.pulses), now_ns())
             now = now_ns()
             if now >= next_poll_ns:
                 next_poll_ns = now + POLL_NS
@@ -211,23 +229,32 @@ class Service:
         try:
             self._port = open_port(self._settings.port, self._profile)
         except PortLostError as lost:
-            if str(lost) != self._trouble:
-                self._event(f"port not there: {lost}")
-            self._trouble = str(lost)
+            if str(lost) != self._port_state.trouble:
+                self._failure(f"port not there: {lost}")
+            self._port_state = self._port_state._replace(trouble=str(lost))
             return False
-        self._reconnects += self._port_state == "lost"
-        if self._port_state == "lost":
+        if self._port_state.name == "lost":
+            self._reconnects += 1
             self._event("port is back")
-        self._port_state, self._trouble = "streaming", ""
-        self._heard_ns = now_ns()
+        self._port_state = LineState("streaming")
+        self._watch = LineWatch(self._profile, self._in_real_time, now_ns())
         return True
 
     def _lose(self, why: str) -> None:
         assert self._port is not None
         self._port.close()
         self._port = None
-        self._port_state, self._trouble = "lost", why
-        self._event(f"port lost: {why}")
+        self._port_state = LineState("lost", why)
+        self._failure(str(self._port_state))
+
+    def _look_at_port(self, now: int) -> None:
+        before, self._port_state = self._port_state, self._watch.state(now)
+        if self._port_state == before:
+            return
+        if self._port_state.trouble:
+            self._failure(str(self._port_state))
+        else:
+            self._event("the rate is right again" if before.name == "streaming" else "the unit is back")
 
     # Housekeeping
 
@@ -236,12 +263,8 @@ class Service:
             sink.poll()
         if self._recorder is not None:
             self._recorder.poll()
-        if self._port_state == "streaming" and now - self._heard_ns > SILENCE_NS:
-            self._port_state, self._trouble = "silent", f"nothing for {SILENCE_NS * NS:g} s"
-            self._event("the unit is silent")
-        elif self._port_state == "silent" and now - self._heard_ns < SILENCE_NS:
-            self._port_state, self._trouble = "streaming", ""
-            self._event("the unit is back")
+        if self._port is not None:
+            self._look_at_port(now)
         self._manager.alive(now)
         if self._is_news or now - self._told_ns >= NS_PER_S:
             self._look_at_calibration()
@@ -253,10 +276,12 @@ class Service:
         self._is_news = False
         seconds = (now - self._told_ns) * NS
         if seconds >= 1.0:
-            lost = self._pipeline.accountant.account.lost
+            account = self._pipeline.accountant.account
             self._rate_hz = (self._samples - self._samples_told) / seconds
-            self._lost_last_s = lost - self._lost_told
-            self._samples_told, self._lost_told, self._told_ns = self._samples, lost, now
+            self._lost_last_s = account.lost - self._lost_told
+            self._samples_told, self._lost_told, self._told_ns = self._samples, account.lost, now
+            if self._port is not None:
+                self._watch.counted(account.expected, now)
         status = self.status(now)
         self._line = json.dumps(status).encode() + b"\n"
         if self._recorder is not None:
@@ -273,7 +298,7 @@ class Service:
             sha256 = config.sha256(self._calibration_path)
         except InputError as error:
             self._calibration_refused = str(error)
-            self._event(f"calibration refused, the old one stays: {error}")
+            self._failure(f"calibration refused, the old one stays: {error}")
             return
         self._calibration_refused = ""
         if sha256 == self._calibration_sha256:
@@ -292,11 +317,14 @@ class Service:
             return 0, 0, 0
         return found.st_mtime_ns, found.st_size, found.st_ino
 
-    def _event(self, text: str) -> None:
+    def _failure(self, text: str) -> None:
+        self._event(text, self._warn)
+
+    def _event(self, text: str, say: Callable[[str], None] | None = None) -> None:
         now = now_ns()
         self._events = [*self._events[1 - _SHOWN_EVENTS :], f"{_utc(now)} {text}"]
         self._is_news = True
-        self._say(self._events[-1])
+        (say or self._say)(self._events[-1])
         if self._recorder is not None:
             self._recorder.event(now, text)
 
@@ -374,8 +402,8 @@ class Service:
             "uptime_s": (now - self._began_ns) * NS,
             "port": {
                 "url": self._settings.port,
-                "state": self._port_state,
-                "trouble": self._trouble,
+                "state": self._port_state.name,
+                "trouble": self._port_state.trouble,
                 "reconnects": self._reconnects,
                 "source": self._source.name.lower(),
             },

@@ -144,6 +144,8 @@ def health(status: Status) -> tuple[str, list[str]]:
     port = status["port"]
     if port["state"] not in ("streaming", "ended"):
         failures.append(f"port {port['state']}: {port['trouble'] or port['url']}")
+    elif port["trouble"]:
+        warnings.append(port["trouble"])
     if not status["account"]["closes"]:
         failures.append("the account of samples does not close: a defect of this product, please report it")
     warnings += [f"unit: {name}" for name in status["unit_status"]["faults"]]

@@ -3,6 +3,7 @@
 import json
 import os
 import pty
+import re
 import signal
 import socket
 import subprocess
@@ -12,6 +13,7 @@ import time
 import tty
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -81,11 +83,14 @@ class Unit:
             n = min(20, count)
             data = frames(self.counter, n)
             self.counter += n
-            while data:
-                try:
-                    data = data[os.write(self._master, data) :]
-                except BlockingIOError:
-                    time.sleep(0.001)
+            self.write(data)
+
+    def write(self, data: bytes) -> None:
+        while data:
+            try:
+                data = data[os.write(self._master, data) :]
+            except BlockingIOError:
+                time.sleep(0.001)
 
     def skip(self, count: int) -> None:
         """Numbers that the unit counts while nobody hears."""
@@ -106,12 +111,15 @@ class Service:
             text=True,
         )
         self.said: list[str] = []
-        assert self.process.stdout is not None
-        self._listener = threading.Thread(target=lambda: self.said.extend(self.process.stdout or []))
-        first = self.process.stdout.readline()
-        self.said.append(first)
-        self._listener.start()
-        assert "serving" in first, first + self.process.stderr.read() if self.process.stderr else first
+        self.warned: list[str] = []
+        self._listeners = [
+            threading.Thread(target=lines.extend, args=[stream])
+            for lines, stream in ((self.said, self.process.stdout), (self.warned, self.process.stderr))
+        ]
+        for listener in self._listeners:
+            listener.start()
+        until(lambda: self.said or self.process.poll() is not None, "the first line")
+        assert self.heard("serving"), self.said + self.warned
 
     def status(self) -> dict[str, Any]:
         return ask(self.socket)
@@ -120,7 +128,12 @@ class Service:
         return int(self.status()["account"]["good"])
 
     def heard(self, words: str) -> bool:
-        return any(words in line for line in self.said)
+        return any(words in line for line in [*self.said, *self.warned])
+
+    def command(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        """Run a command that asks this service."""
+        command = [sys.executable, "-m", "imudrv", *arguments, "--status", str(self.socket)]
+        return subprocess.run(command, capture_output=True, text=True, timeout=300)
 
     def stop(self, number: int = signal.SIGTERM) -> int:
         self.process.send_signal(number)
@@ -128,7 +141,8 @@ class Service:
 
     def ended(self) -> int:
         code = self.process.wait(DEADLINE_S)
-        self._listener.join()
+        for listener in self._listeners:
+            listener.join()
         return code
 
 
@@ -144,6 +158,39 @@ def serving(folder: Path, *arguments: object, stdin: int = subprocess.DEVNULL) -
         for stream in (service.process.stdout, service.process.stderr):
             if stream is not None:
                 stream.close()
+
+
+@contextmanager
+def repeating(write: Callable[[], object]) -> Iterator[None]:
+    """Write to a line again and again, about every 20 ms."""
+    stop = threading.Event()
+
+    def repeat() -> None:
+        while not stop.wait(0.02):
+            write()
+
+    thread = threading.Thread(target=repeat)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+
+
+@contextmanager
+def simulated(folder: Path, profile: str) -> Iterator[None]:
+    """A unit at rest in a process of its own, on the pty that `serial` names."""
+    command = ["sim", "static", "--profile", profile, "--port", "pty", "--link", str(folder / "unit")]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "imudrv", *command], cwd=folder, stdout=subprocess.DEVNULL
+    )
+    try:
+        until((folder / "unit").exists, "the simulated unit")
+        yield
+    finally:
+        process.kill()
+        process.wait()
 
 
 @pytest.fixture
@@ -220,6 +267,62 @@ def test_silence_is_told_and_nothing_exits(folder: Path) -> None:
         assert service.stop(signal.SIGINT) == 0
         assert service.heard("100 good")
     assert not service.socket.exists()
+
+
+def test_bytes_without_a_frame_are_a_failure_until_frames_come_again(folder: Path) -> None:
+    unit = Unit(folder / "unit")
+    garbage = bytes(range(1, 200))  # no sync in it
+    with serving(folder, *serial(folder)) as service:
+        with repeating(lambda: unit.send(20)):
+            until(lambda: service.good() > 500, "good frames")
+            assert service.command("status").returncode != 4
+        with repeating(lambda: unit.write(garbage)):
+            until(lambda: service.status()["health"] == "fail", "the failure in the status")
+            until(lambda: service.status()["port"]["state"] == "unreadable", "what has failed")
+            told = service.command("status")
+            assert told.returncode == 4
+            found = re.match(
+                r"fail\nport unreadable: (\d+) bytes in \d+\.\d s, and no frame of imu50-rs422 in them",
+                told.stdout,
+            )
+            assert found, told.stdout
+            assert int(found[1]) >= len(garbage)
+            assert "unreadable" in service.command("monitor").stdout
+            assert any(found[0].removeprefix("fail\n") in line for line in service.warned)
+        with repeating(lambda: unit.send(20)):
+            until(lambda: service.status()["port"]["state"] == "streaming", "the frames read again")
+            assert service.status()["health"] != "fail"
+        assert service.stop() == 0
+
+
+def test_a_wrong_profile_is_a_failure_from_the_start(folder: Path) -> None:
+    with simulated(folder, "imu50-rs422-acc"), serving(folder, *serial(folder)) as service:
+        until(lambda: service.status()["health"] == "fail", "the failure")
+        assert "no frame of imu50-rs422 in them" in service.status()["reasons"][0]
+        assert service.good() == 0
+        assert service.stop() == 0
+
+
+def test_a_unit_at_another_rate_than_its_profile_is_reported_with_both_rates(folder: Path) -> None:
+    text = (resources.files("imudrv.profiles") / "imu50-rs422.yaml").read_text("utf-8")
+    (folder / "slow.yaml").write_text(text.replace("sample_rate_hz: 1000", "sample_rate_hz: 200"))
+    with simulated(folder, "slow.yaml"), serving(folder, *serial(folder)) as service:
+        until(lambda: service.heard("the unit counts"), "the rate")
+        until(lambda: service.status()["port"]["trouble"], "the rate in the status")
+        status = service.status()
+        assert status["health"] == "warn"
+        assert status["port"]["state"] == "streaming"
+        assert status["reasons"][0].startswith("expected 1000 samples/s of imu50-rs422, the unit counts ")
+        assert any(status["reasons"][0] in line for line in service.warned)
+        assert service.stop() == 0
+
+
+def test_a_simulated_unit_at_another_speed_is_not_said_to_be_at_a_wrong_rate(folder: Path) -> None:
+    arguments = ["--port", "sim://static?speed=10", *serial(folder)[2:]]
+    with serving(folder, *arguments) as service:
+        until(lambda: service.good() > 60_000, "six seconds' samples")  # a rate is judged after four
+        assert service.status()["port"]["trouble"] == ""
+        assert service.stop() == 0
 
 
 def test_a_calibration_is_exchanged_while_running_and_a_bad_one_is_refused(folder: Path) -> None:
@@ -312,15 +415,11 @@ def test_a_status_for_scripts_and_one_for_people(folder: Path) -> None:
         until(lambda: service.good() == 100, "the samples")
         until(lambda: service.status()["port"]["state"] == "silent", "silence")
 
-        def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-            command = [sys.executable, "-m", "imudrv", *arguments, "--status", str(service.socket)]
-            return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300)
-
-        as_json = run("status", "--json")
+        as_json = service.command("status", "--json")
         assert as_json.returncode == 4
         assert json.loads(as_json.stdout)["account"]["good"] == 100
-        assert run("status").stdout.startswith("fail\nport silent")
-        assert "100 good" in run("monitor").stdout
+        assert service.command("status").stdout.startswith("fail\nport silent")
+        assert "100 good" in service.command("monitor").stdout
         second = subprocess.run(
             [
                 sys.executable,
@@ -339,13 +438,7 @@ def test_a_status_for_scripts_and_one_for_people(folder: Path) -> None:
         assert second.returncode == 2
         assert "expected no other service" in second.stderr
         assert service.stop() == 0
-    gone = subprocess.run(
-        [sys.executable, "-m", "imudrv", "status", "--status", str(service.socket)],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
+    gone = service.command("status")
     assert gone.returncode == 2
     assert "expected a running service" in gone.stderr
 

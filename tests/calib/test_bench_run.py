@@ -23,9 +23,11 @@ from calib.procedure import load
 from calib.rehearsal import BENCH, technician
 from calib.result import Attempt, identify
 from calib.session import JOURNAL, verify
-from imudrv.calibration import SizeEffect, read_calibration
+from imudrv import config
+from imudrv.calibration import SizeEffect, read_calibration, write_calibration
 from imudrv.config import sha256
 from imudrv.errors import InputError
+from imudrv.sim.scenario import NOMINAL
 
 # The alignment is short: of what follows from it, heading and biases, the joint estimate finds most anew.
 PROCEDURE = """
@@ -80,7 +82,7 @@ def until(process: subprocess.Popen[str], true: Callable[[], bool]) -> None:
     while not true():
         if process.poll() is not None or time.monotonic() > end:
             process.kill()
-            raise AssertionError("\n".join(process.communicate()))
+            raise AssertionError("\n".join(filter(None, process.communicate())))
         time.sleep(0.01)
 
 
@@ -117,6 +119,45 @@ def test_the_operator_is_led_through_every_step_and_told_what_has_come_out(
             assert any(step in line and words in line for line in said.splitlines())
     assert f"report: {folder / 'report.html'}" in said
     assert "half a turn leaves" in said
+
+
+def test_a_rehearsal_in_fast_time_is_not_said_to_be_at_a_wrong_rate(undisturbed: tuple[Path, str]) -> None:
+    folder, said = undisturbed
+    assert "samples/s" not in said + (folder / JOURNAL).read_text()
+
+
+def test_the_operator_is_told_that_the_unit_sends_no_frame_of_the_profile(tmp_path: Path) -> None:
+    write_calibration(tmp_path / "unit.yaml", NOMINAL)
+    config.write(tmp_path / "site.yaml", BENCH)
+    (tmp_path / "short.yaml").write_text(PROCEDURE)
+    files = ["--calibration", "unit.yaml", "--site", "site.yaml", "--procedure", "short.yaml"]
+    sends = ["sim", "static", "--profile", "imu50-rs422-acc", "--port", "pty", "--link", "port"]
+    port = ["--port", str(tmp_path / "port"), "--profile", "imu50-rs422"]
+    shown = tmp_path / "shown"
+    with shown.open("w") as screen:
+        unit, operator = (
+            subprocess.Popen(
+                [sys.executable, "-m", *command],
+                cwd=tmp_path,
+                stdin=subprocess.DEVNULL,
+                stdout=screen,
+                stderr=screen,
+                text=True,
+            )
+            for command in (
+                ["imudrv", *sends],
+                ["calib", "run", *port, *files, "--session", "session", "--hands-free"],
+            )
+        )
+    try:
+        until(operator, lambda: "preflight: NO FRAMES: CHECK THE PROFILE" in shown.read_text())
+        assert "and no frame of imu50-rs422 in them" in shown.read_text()
+        operator.send_signal(signal.SIGINT)
+        assert operator.wait(DEADLINE_S) == 130
+    finally:
+        for process in (unit, operator):
+            process.kill()
+            process.wait()
 
 
 def test_the_active_certificate_is_the_result_and_the_old_one_is_kept(undisturbed: tuple[Path, str]) -> None:

@@ -1,6 +1,6 @@
 """The worker between engine, session and operator, with samples from a queue instead of a unit."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from io import StringIO
 from pathlib import Path
@@ -18,6 +18,7 @@ from calib.rehearsal import BENCH, Mistake, technician
 from calib.session import Document, Session, verify
 from imudrv import config, profiles
 from imudrv.calibration import coefficients, write_calibration
+from imudrv.diagnosis import LineState
 from imudrv.errors import InputError
 from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import rate_filter
@@ -42,6 +43,12 @@ class Recorder:
 
     def __init__(self) -> None:
         self.stopped = False
+        self.states: list[LineState] = []
+
+    @property
+    def port_state(self) -> LineState:
+        """The next state at each look; at last nothing is wrong."""
+        return self.states.pop(0) if self.states else LineState("streaming")
 
     def record(self, path: Path | None) -> Future[None]:
         done: Future[None] = Future()
@@ -118,9 +125,11 @@ def conducted(
     *,
     hands_free: bool = True,
     stopped: bool = True,
+    port_states: Sequence[LineState] = (),
 ) -> tuple[Conduct, str]:
     """Work through items, behind which nothing comes; `stopped`: the service ended before they were taken."""
     tap, recorder, keys = Tap(None), Recorder(), keys or Typed()
+    recorder.states += port_states
     for item in items:
         if isinstance(item, str):
             tap.tell(item)
@@ -200,7 +209,8 @@ def test_what_the_service_says_of_the_port_is_shown_and_journaled(
 ) -> None:
     monkeypatch.setattr(conducts, "SHOWN_S", 0.0)
     lost = "port lost: the other end has gone"
-    _, text = conducted(session, [*batches[:50], lost, *batches[50:60]])
+    states = [LineState("streaming")] * 20 + [LineState("lost", "the other end has gone")] * 20
+    _, text = conducted(session, [*batches[:50], lost, *batches[50:60]], port_states=states)
     assert f"! {lost}" in text
     assert [entry["text"] for entry in session.entries if entry["event"] == "service"] == [lost]
     assert "!" not in text.splitlines()[-1]

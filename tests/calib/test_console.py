@@ -12,8 +12,9 @@ import pytest
 from rich.console import Console
 
 from calib import letters
-from calib.console import UNHEARD, Keys, Screen, plain, screen, unheard
+from calib.console import UNHEARD, UNREADABLE, Keys, Screen, plain, screen, with_port_state
 from calib.events import Abort, Confirm, Phase, Redo, Skip, View
+from imudrv.diagnosis import LineState
 
 LONG = (
     "gravity reads 9.203 m/s^2 where 9.792 +- 0.02 is expected: check the accelerometers' scale factors",
@@ -31,6 +32,7 @@ HEADLINES = (
     "GOOD: STEP 12 OF 20 DONE",
     "THE UNIT TELLS A FAULT",
     UNHEARD,
+    UNREADABLE,
 )
 
 
@@ -135,10 +137,25 @@ def test_a_question_takes_the_place_of_the_keys() -> None:
     assert rows(view(), question="once more: abort")[-1] == "once more: abort"
 
 
-def test_while_nothing_is_heard_that_is_the_headline() -> None:
-    shown = unheard(view(), "port lost: the port is gone")
-    assert plain(shown).endswith("place: NO DATA: CHECK THE CABLE | ! port lost: the port is gone")
-    assert "port lost: the port is gone" in "\n".join(rows(shown))
+@pytest.mark.parametrize(
+    ("state", "line"),
+    [
+        (LineState("lost", "the port is gone"), "NO DATA: CHECK THE CABLE | ! port lost: the port is gone"),
+        (
+            LineState("silent", "nothing for 0.4 s"),
+            "NO DATA: CHECK THE CABLE | ! port silent: nothing for 0.4 s",
+        ),
+        (LineState("unreadable", "no frame"), "NO FRAMES: CHECK THE PROFILE | ! port unreadable: no frame"),
+        (LineState("streaming", "expected 1000 samples/s"), "TURN IT: X UP | ! expected 1000 samples/s"),
+        (LineState("streaming"), "TURN IT: X UP"),
+    ],
+)
+def test_what_is_wrong_with_the_line_is_shown_and_without_samples_it_is_the_headline(
+    state: LineState, line: str
+) -> None:
+    shown = with_port_state(view(), state)
+    assert plain(shown).endswith(f"place: {line}")
+    assert state.trouble in "\n".join(rows(shown))
 
 
 def test_a_terminal_without_blocks_gets_ascii() -> None:
