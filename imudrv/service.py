@@ -34,6 +34,7 @@ from imudrv.records import INCREMENTS, PULSES, Flag
 from imudrv.settings import Settings, default_status_path
 from imudrv.sinks import open_sink
 from imudrv.sinks.base import Batch, Sink
+from imudrv.sinks.history import History
 from imudrv.sinks.recorder import Recorder
 from imudrv.status import Status, StatusServer, health
 from imudrv.units import NS, NS_PER_S
@@ -61,6 +62,8 @@ class Service:
         Told each event in a line.
     sinks : sequence of Sink
         More ways out than the settings have.
+    history : History, optional
+        Filled by the loop, for recordings that begin in the past.
 
     Raises
     ------
@@ -68,7 +71,13 @@ class Service:
         Something in the settings cannot be: all that can be told before the unit is there is told now.
     """
 
-    def __init__(self, settings: Settings, say: Callable[[str], None], sinks: Sequence[Sink] = ()) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        say: Callable[[str], None],
+        sinks: Sequence[Sink] = (),
+        history: History | None = None,
+    ) -> None:
         self._settings = settings
         self._say = say
         self._profile = profiles.load(settings.profile)
@@ -84,7 +93,9 @@ class Service:
         self._pipeline = Pipeline(self._profile, coefficients(self._calibration), self._rates)
         self._latency = Latency(self._layout.interval_ns)
         self._signals = Signals()
-        self._switches: deque[tuple[Path | None, Future[None]]] = deque()
+        self._history = history
+        self._switches: deque[tuple[Path | None, int | None, Future[None]]] = deque()
+        self._has_ended = False
         self._manager = Manager()
         self._notices: list[str] = []
         self._events: list[str] = []
@@ -136,21 +147,27 @@ class Service:
         """End `run`, as SIGTERM does; for any thread."""
         self._signals.stop = True
 
-    def record(self, path: Path | None) -> Future[None]:
+    def record(self, path: Path | None, since: int | None = None) -> Future[None]:
         """Record into another file, or into none; for any thread.
 
         Parameters
         ----------
         path : Path or None
-            From the next read on. There must be no such file yet.
+            There must be no such file yet.
+        since : int, optional
+            Counter of the sample to begin with, as far back as the history reaches; not given: the next read.
+            The recording before is not shortened: both then have what came meanwhile.
 
         Returns
         -------
         Future
             Done when the recording before is closed; the `InputError` where the new one cannot be made.
+            Cancelled when the service ends first: the recording before is closed then, too.
         """
         done: Future[None] = Future()
-        self._switches.append((path, done))
+        self._switches.append((path, since, done))
+        if self._has_ended:
+            done.cancel()
         return done
 
     def _serve(self) -> None:
@@ -181,6 +198,8 @@ class Service:
                         self._heard_ns = now_ns()
                         if self._recorder is not None:
                             self._recorder.arrived(arrival)
+                        if self._history is not None:
+                            self._history.arrived(arrival)
                         self._publish(self._pipeline.feed(arrival.data, arrival.t_ns), arrival.t_ns)
             now = now_ns()
             if now >= next_poll_ns:
@@ -197,6 +216,8 @@ class Service:
         batch = Batch(pulses, increments, encode(increments, self._source))
         for sink in self._sinks:
             sink.publish(batch)
+        if self._history is not None:
+            self._history.publish(batch)
         if not len(increments):
             return
         if self._source is not Source.REPLAY:
@@ -283,6 +304,8 @@ class Service:
         self._pipeline.exchange(coefficients(calibration))
         if self._recorder is not None:
             self._recorder.calibration(now_ns(), self._calibration_path.read_bytes())
+        if self._history is not None:
+            self._history.clear()  # a recording begins with one calibration
         self._event(f"calibration exchanged: {sha256[:12]}")
 
     def _calibration_mark(self) -> tuple[int, int, int]:
@@ -301,13 +324,16 @@ class Service:
             self._recorder.event(now, text)
 
     def _switch_recording(self) -> None:
-        path, done = self._switches.popleft()
+        path, since, done = self._switches.popleft()
         before, self._recorder = self._recorder, None
         if path is not None:
             try:
                 self._recorder = self._open_recorder(path)
             except InputError as error:
                 done.set_exception(error)
+            else:
+                if since is not None and self._history is not None:
+                    self._recorder.catch_up(self._history.since(since))
 
         def close() -> None:
             if before is not None:
@@ -340,8 +366,9 @@ class Service:
         self._refresh(now_ns())
         if self._recorder is not None:
             self._recorder.close()
-        for _, done in self._switches:
-            done.cancel()
+        self._has_ended = True
+        while self._switches:
+            self._switches.popleft()[-1].cancel()
         self._open.close()
 
     # What it tells
