@@ -5,6 +5,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from importlib import resources
 from pathlib import Path
@@ -26,6 +27,7 @@ from imudrv.errors import InputError
 from imudrv.service import Service
 from imudrv.settings import Settings
 from imudrv.sim.live import speed_of
+from imudrv.sinks.history import History
 from imudrv.site import Site
 from imudrv.units import MM
 
@@ -59,6 +61,7 @@ def run(
     hands_free: bool = False,
     rehearse: bool = False,
     speed: str = "1",
+    redo: Sequence[str] = (),
     console: Console,
 ) -> int:
     """Lead through a session, a new one or one that is there.
@@ -80,6 +83,8 @@ def run(
         With a simulated unit and technician, hands free.
     speed : str
         Of the rehearsal: a number, or ``max``.
+    redo : sequence of str
+        Steps of a session that is there, to be done again.
     console : Console
         Where it is shown.
 
@@ -103,6 +108,8 @@ def run(
         raise InputError("--rehearse: expected no --port, --calibration or --site; it has a unit of its own")
     if is_there and rehearse and not Rehearsal.was(folder):
         raise InputError(f"{folder}: expected a rehearsal to go on with, got the session of a unit")
+    if redo and not is_there:
+        raise InputError(f"--redo: expected a session that is there, with --session, got none in {folder}")
     if is_there:
         session = Session.open(folder)
     else:
@@ -126,7 +133,7 @@ def run(
     try:
         if is_there:
             _require_resumable(session, procedure, calibration, site, profile)
-            _resume(session, console, asks=rehearsal is None and not hands_free)
+            _resume(session, console, redo, asks=rehearsal is None and not hands_free)
         return _conducted(session, port or session.plan.port, keys, rehearsal, hands_free, console)
     finally:
         session.close()
@@ -252,6 +259,7 @@ def _conducted(
         lambda text: tap.tell(text.partition(" ")[2]),
         [tap],
         in_real_time=rehearsal is None,
+        history=History(),
     )
 
     def begin(steps: Procedure) -> None:
@@ -303,7 +311,7 @@ def _require_resumable(
     )
 
 
-def _resume(session: Session, console: Console, asks: bool) -> None:
+def _resume(session: Session, console: Console, redo: Sequence[str], asks: bool) -> None:
     """Say where the session was, ask whether to go on there, and clear up."""
     lines = [session.dropped] if session.dropped else []
     accepted = ", ".join(session.accepted) or "no step yet"
@@ -311,6 +319,7 @@ def _resume(session: Session, console: Console, asks: bool) -> None:
     console.print("\n".join(lines), markup=False, soft_wrap=True)
     if asks and console.input("go on there? \\[y/n] ").strip().lower() not in ("y", "yes"):
         raise InputError(f"{session.folder}: left as it is; name another folder for a new session")
+    session.redo(redo)
     left = session.enter_leftovers()
     session.append({"event": "resumed", "left": left})
 

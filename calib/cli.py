@@ -129,6 +129,13 @@ def _commands() -> CommandLine:
     sub.add_argument(
         "--session", type=Path, metavar="DIR", help="journal and evidence; one that is there is resumed"
     )
+    sub.add_argument(
+        "--redo",
+        action="append",
+        default=[],
+        metavar="STEP",
+        help="do this step of a session that is there again; may be repeated",
+    )
     sub.add_argument("--hands-free", action="store_true", help="go on by the sensors alone")
     sub.add_argument("--rehearse", action="store_true", help="with a simulated unit and technician")
     sub.add_argument("--speed", default="1", metavar="X", help="of the rehearsal: 1, 10, ... or max")
@@ -224,6 +231,7 @@ def _run(arguments: argparse.Namespace) -> int:
         hands_free=arguments.hands_free,
         rehearse=arguments.rehearse,
         speed=arguments.speed,
+        redo=arguments.redo,
         console=Console(),
     )
 

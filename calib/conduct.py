@@ -4,15 +4,23 @@ The service reads the unit in the main thread, as it does in production. One of 
 queue, from which `Conduct` takes samples: it feeds the engine, journals what that says, begins and ends
 recordings, shows the view and reads keys. Engine and session do not know each other.
 
+The worker may be late, by seconds on a loaded machine or a slow disk, and the evidence is right all the same:
+
+- A recording begins at the sample at which the engine asked for the unit to be placed, however late the
+  worker comes to that event: the service keeps the last minutes of the line (`imudrv.sinks.history`).
+- A step is accepted, shown as good and journaled only after its recording has been closed, decoded and found
+  to hold every sample of the evidence. Otherwise the step is rejected with that reason and asked again.
+- The worker never waits for the terminal: a `Screen` writes in a thread of its own.
+
 A session goes through stages: the steps, the result, the decision, the verification. Each leaves its line in
 the journal, so that a session that is resumed goes on behind the last.
 """
 
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, wait
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, fields
 from queue import Empty, SimpleQueue
 from typing import Final
 
@@ -28,15 +36,14 @@ from calib.events import (
     Entered,
     Event,
     Finished,
-    Log,
     Phase,
     Rejected,
 )
 from calib.gauge import convert
 from calib.journal import Entry
-from calib.procedure import Pose, Procedure, Step, opposite
+from calib.procedure import VERIFICATION, Procedure, steps_left, verification
 from calib.report import arms_text, report_html, verdict
-from calib.result import Left, Result, velocity_left
+from calib.result import Attempt, Left, Result, uncovered, velocity_left
 from calib.session import REPORT, RESULT, Session
 from imudrv import config
 from imudrv.calibration import Calibration, read_calibration, write_calibration
@@ -50,11 +57,9 @@ from imudrv.wire.layout import Layout
 
 SHOWN_S: Final = 0.2
 """The screen is drawn anew this often, and keys are read."""
-VERIFICATION: Final = "verification"
-"""Step id of the rotation at the end."""
 ABORT: Final = "q once more: abort, keep what is accepted. Any other key: go on"
 CLOSED_S: Final = 10.0
-"""So long it is waited for a recording to be closed once the service has ended."""
+"""Longest wait for a recording to be closed once the service has ended."""
 
 
 class Tap(Sink):
@@ -162,12 +167,13 @@ class Conduct:
         self.error: BaseException | None = None
         self.outcome = ""
         self._session, self._procedure, self._layout = session, procedure, layout
+        self._steps = {step.id: step for step in (*procedure.steps, *verification(procedure).steps)}
         self._service, self._tap, self._screen, self._keys = service, tap, screen, keys
         self._hands_free, self._begin = hands_free, begin
         self._is_new_to_unit = True
         self._backlog: deque[Batch] = deque()
-        self._closing: deque[tuple[Future[None], Callable[[], None]]] = deque()
         self._recording = ""
+        self._has_ended = False
         self._conditions = Conditions()
         self._told_ns = 0
 
@@ -181,13 +187,13 @@ class Conduct:
         except BaseException as error:
             self.error = error
         finally:
-            self._screen.close()
             self._tap.release()
             self._service.stop()
+            self._screen.close()
 
     def _stages(self) -> None:
         session = self._session
-        if self._said("finished") is None:
+        if session.entry("finished") is None:
             last = self._through(self._procedure)
             if isinstance(last, Aborted):
                 return
@@ -202,7 +208,7 @@ class Conduct:
         result = self._result()
         if self._tap.is_closed:
             raise _StoppedError  # nothing is decided behind a Ctrl-C
-        decision = self._said("decision")
+        decision = session.entry("decision")
         if decision is None:
             decision = {"event": "decision", "accepted": self._decided(result)}
             session.append(decision)
@@ -210,11 +216,11 @@ class Conduct:
             self.outcome = f"turned down; {session.plan.certificate} stays as it was"
             return
         self._activate(result.certificate)
-        last = self._through(_verification(self._procedure))
+        last = self._through(verification(self._procedure))
         if isinstance(last, Aborted):
             return
         left = self._left(result.certificate) if VERIFICATION in last.accepted else None
-        if self._said("end") is None:
+        if session.entry("end") is None:
             self._write_report(result, left)
             session.append({"event": "end", "velocity_left_m_s": None if left is None else left._asdict()})
         self.outcome = "\n".join(
@@ -224,9 +230,6 @@ class Conduct:
                 f"report: {session.folder / REPORT}",
             ]
         )
-
-    def _said(self, event: str) -> Entry | None:
-        return next((entry for entry in self._session.entries if entry["event"] == event), None)
 
     # Steps
 
@@ -247,24 +250,23 @@ class Conduct:
         last = self._happened(engine, engine.feed(np.zeros(0, INCREMENTS)))
         if last is None:
             self._begin(steps_left(procedure, accepted))
-        shown, shown_s = engine.view, 0.0
-        while last is None:
-            batch = self._next()
-            events = () if batch is None else self._sampled(engine, batch)
-            is_due = time.monotonic() - shown_s >= SHOWN_S
-            if is_due and (action := self._keys.action(shown)):
-                events += engine.act(action)
-            last = self._happened(engine, events)
-            self._file_closed()
-            if events or is_due:
-                shown, shown_s = engine.view, time.monotonic()
-                drawn = with_port_state(shown, self._service.port_state)
-                self._screen.show(drawn, ABORT if self._keys.asks else "")
+        try:
+            shown_s = 0.0
+            while last is None:
+                batch = self._next()
+                events = () if batch is None else self._sampled(engine, batch)
+                is_due = time.monotonic() - shown_s >= SHOWN_S
+                if is_due and (shown := self._screen.shown) and (action := self._keys.action(shown)):
+                    events += engine.act(action)
+                last = self._happened(engine, events)
+                if events or is_due:
+                    shown_s = time.monotonic()
+                    view = with_port_state(engine.view, self._service.port_state)
+                    self._screen.show(view, ABORT if self._keys.asks else "")
+        except _StoppedError:
+            self._enter_recording()  # the service has closed it
+            raise
         self._end_recording()
-        while self._closing:
-            if batch := self._take():
-                self._backlog.append(batch)
-            self._file_closed()
         return last
 
     def _next(self) -> Batch | None:
@@ -272,6 +274,8 @@ class Conduct:
         return self._backlog.popleft() if self._backlog else self._take()
 
     def _take(self) -> Batch | None:
+        if self._has_ended:
+            raise _StoppedError
         try:
             item = self._tap.take(SHOWN_S)
         except Empty:
@@ -279,10 +283,21 @@ class Conduct:
         if isinstance(item, Batch):
             return item
         if item is None:
-            self._file_all()
+            self._has_ended = True
             raise _StoppedError
-        self._journal({"event": "service", "text": item})
+        self._session.append({"event": "service", "text": item})
         return None
+
+    def _wait(self, done: Future[None]) -> None:
+        """Wait until the service has done something or has ended; samples that come meanwhile are kept."""
+        try:
+            while not done.done():
+                if batch := self._take():
+                    self._backlog.append(batch)
+        except _StoppedError:
+            wait([done], CLOSED_S)
+        if done.done() and not done.cancelled():
+            done.result()
 
     def _sampled(self, engine: Engine, batch: Batch) -> tuple[Event, ...]:
         events: tuple[Event, ...] = ()
@@ -303,7 +318,7 @@ class Conduct:
         session = self._session
         session.require_temperature(self._conditions.temperature_degc)
         newest = max((entry.get("counter", -1) for entry in session.entries), default=-1)
-        self._journal(
+        session.append(
             {
                 "event": "heard",
                 "counter": counter,
@@ -314,75 +329,70 @@ class Conduct:
 
     def _happened(self, engine: Engine, events: Sequence[Event]) -> Finished | Aborted | None:
         last: Finished | Aborted | None = None
-        for event in events:
+        waiting = deque(events)
+        while waiting:
+            event = waiting.popleft()
+            if isinstance(event, Accepted):
+                if reason := self._filed(engine, event):
+                    waiting += engine.reject(event.step_id, reason)
+                continue
             if isinstance(event, Finished | Aborted):
                 last = event
-            if isinstance(event, Accepted):
-                log = next(log for log in reversed(engine.runs) if log.step_id == event.step_id)
-                self._end_recording(self._filing(event, log))
-                continue
             if isinstance(event, Rejected):
                 self._end_recording()
+                last = None
             if isinstance(event, Entered) and event.phase is Phase.PLACE:
-                self._begin_recording(f"run-{event.step_id}-{event.attempt}")
+                self._begin_recording(f"run-{event.step_id}-{event.attempt}", event.counter)
             if not isinstance(event, Finished):
-                self._journal(_entry(event))
+                self._session.append(_entry(event))
         return last
 
-    # Recordings; what is said of them waits in a row, so that the journal has all in order
+    # Recordings
 
-    def _begin_recording(self, name: str) -> None:
+    def _begin_recording(self, name: str, since: int) -> None:
         if name == self._recording:
             return
         self._end_recording()
+        begun = self._service.record(self._session.folder / f"{name}.mcap", since)
+        self._wait(begun)
+        if begun.cancelled():
+            raise _StoppedError
         self._recording = name
-        self._closing.append((self._service.record(self._session.folder / f"{name}.mcap"), lambda: None))
 
-    def _end_recording(self, then: Callable[[], None] = lambda: None) -> None:
-        name, self._recording = self._recording, ""
-        if not name:
-            return
-
-        def enter() -> None:
-            self._session.enter(f"{name}.mcap")
-            then()
-
-        self._closing.append((self._service.record(None), enter))
-
-    def _filing(self, event: Accepted, log: Log) -> Callable[[], None]:
-        """File an accepted attempt: its log, then the line that makes it count."""
-        name, degc = self._recording, dict(self._conditions.temperature_degc)
-
-        def file() -> None:
-            with replacing(self._session.folder / f"{name}.npz") as archive:
-                np.savez(archive, **{f.name: getattr(log, f.name) for f in fields(log)})
-            self._session.enter(f"{name}.npz")
-            self._session.append({**_entry(event), "recording": f"{name}.mcap", "temperature_degc": degc})
-
-        return file
-
-    def _journal(self, entry: Entry) -> None:
-        if not self._closing:
-            self._session.append(entry)
-            return
-        done: Future[None] = Future()
-        done.set_result(None)
-        self._closing.append((done, lambda: self._session.append(entry)))
-
-    def _file_closed(self) -> None:
-        while self._closing and self._closing[0][0].done():
-            closed, then = self._closing.popleft()
-            closed.result()
-            then()
-
-    def _file_all(self) -> None:
-        """The service has ended, and all recordings with it."""
-        while self._closing:
-            closed, then = self._closing.popleft()
-            wait([closed], CLOSED_S)
-            then()
+    def _end_recording(self) -> None:
         if self._recording:
-            self._session.enter(f"{self._recording}.mcap")
+            self._wait(self._service.record(None))
+            self._enter_recording()
+
+    def _enter_recording(self) -> None:
+        name, self._recording = self._recording, ""
+        if name:
+            self._session.enter(f"{name}.mcap")
+
+    def _filed(self, engine: Engine, event: Accepted) -> str:
+        """File an accepted attempt: recording, log, then the line that makes it count; or say why not."""
+        session, name = self._session, self._recording
+        self._end_recording()
+        attempt = Attempt(
+            self._steps[event.step_id],
+            session.folder / f"{name}.mcap",
+            event.first_counter,
+            event.last_counter,
+            event.samples,
+        )
+        try:
+            lacks = uncovered(attempt)
+        except InputError as error:
+            return str(error)
+        if lacks:
+            return f"{lacks}: this computer, or its disk, was held up for too long"
+        log = next(log for log in reversed(engine.runs) if log.step_id == event.step_id)
+        with replacing(session.folder / f"{name}.npz") as archive:
+            np.savez(archive, **{f.name: getattr(log, f.name) for f in fields(log)})
+        session.enter(f"{name}.npz")
+        degc = dict(self._conditions.temperature_degc)
+        session.append({**_entry(event), "recording": f"{name}.mcap", "temperature_degc": degc})
+        return ""
 
     # After the steps
 
@@ -402,6 +412,8 @@ class Conduct:
         if self._hands_free:
             return all(mark != "bad" for mark, _ in verdict(result.findings))
         self._screen.print(f"Accept it as the certificate of unit {self._session.plan.unit}? [y/n]")
+        while not self._screen.is_idle:
+            self._take()
         self._keys.read()  # what was typed before the question is no answer to it
         answer = ""
         while not answer:
@@ -424,7 +436,7 @@ class Conduct:
 
     def _left(self, certificate: Calibration) -> Left:
         """Velocity left by the verification rotation."""
-        session, procedure = self._session, _verification(self._procedure)
+        session, procedure = self._session, verification(self._procedure)
         attempt = session.attempt_at(procedure.steps[0])
         return velocity_left(procedure, attempt, certificate, session.site())
 
@@ -438,35 +450,6 @@ class Conduct:
         self._session.enter(REPORT)
 
 
-def steps_left(procedure: Procedure, done: Collection[str]) -> Procedure:
-    """The procedure of the steps that are not done.
-
-    Parameters
-    ----------
-    procedure : Procedure
-        The whole one.
-    done : collection of str
-        Ids of steps; not all of them.
-
-    Returns
-    -------
-    Procedure
-    """
-    return _procedure(procedure, [step for step in procedure.steps if step.id not in done])
-
-
-def _verification(procedure: Procedure) -> Procedure:
-    """One more rotation, from where the last one ended."""
-    last = procedure.steps[-1]
-    return _procedure(procedure, [replace(last, id=VERIFICATION, east=opposite(last.east))])
-
-
-def _procedure(procedure: Procedure, steps: Sequence[Step]) -> Procedure:
-    """The same with other steps."""
-    poses = tuple(Pose.model_validate(vars(step)) for step in steps)
-    return procedure.model_copy(update={"poses": poses})
-
-
 def _summary(result: Result) -> str:
     """What the operator has to know to decide."""
     verdicts = [f"{mark}: {text}" for mark, text in verdict(result.findings)]
@@ -478,7 +461,7 @@ def _entry(event: Event) -> Entry:
 
 
 def _accepted(entry: Entry) -> Accepted:
-    values = {f.name: entry[f.name] for f in fields(Accepted)}
+    values = {f.name: entry[f.name] for f in fields(Accepted) if f.name in entry}
     return Accepted(**{**values, "v_n": tuple(values["v_n"])})
 
 

@@ -10,7 +10,9 @@ import termios
 import textwrap
 import tty
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from types import TracebackType
 from typing import Any, Final, Self
 
@@ -176,18 +178,36 @@ class Keys:
 class Screen:
     """Where views are shown.
 
+    A thread of its own writes, so that nobody waits for a terminal that is stopped (Ctrl-S) or for a slow
+    line. A view that has not been written yet is replaced by the next one; lines of text are kept, in order.
+
     Parameters
     ----------
     console : Console
         Of rich. Without a terminal, or on a dumb one, it gets plain lines.
+
+    Attributes
+    ----------
+    shown : View or None
+        The newest view that has been written: the one that the operator's keys refer to.
     """
 
     def __init__(self, console: Console) -> None:
+        self.shown: View | None = None
         self._console = console
         self._is_plain = not console.is_terminal or console.is_dumb_terminal
         self._live: Live | None = None
         self._bells = 0
         self._last = ""
+        self._writer = ThreadPoolExecutor(1, "screen")
+        self._newest: Future[None] | None = None
+        self._newest_view: Future[None] | None = None
+        self._newest_text = ""
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether everything has been written."""
+        return self._newest is None or self._newest.done()
 
     def show(self, view: View, question: str = "") -> None:
         """Show a view.
@@ -198,33 +218,62 @@ class Screen:
             Of the engine.
         question : str
             In the place of the keys.
-        """
-        if view.bells > self._bells and not self._is_plain:
-            self._console.bell()
-        self._bells = view.bells
-        if self._is_plain:
-            self.say(plain(view, question))
-            return
-        if self._live is None:
-            self._live = Live(console=self._console, auto_refresh=False, screen=True)
-            self._live.start()
-        size = self._console.size
-        ascii_only = self._console.options.ascii_only
-        self._live.update(screen(view, size.width, size.height, question, ascii_only), refresh=True)
 
-    def say(self, text: str) -> None:
-        """Print a line, unless it was the last one or a screen stands in its place."""
-        if text != self._last and self._live is None:
-            self._console.print(text, markup=False, highlight=False, soft_wrap=True)
-            self._last = text
+        Raises
+        ------
+        OSError
+            The terminal cannot be written to any more.
+        """
+        text = plain(view, question) if self._is_plain else ""
+        if self._newest_view is not None and text == self._newest_text:
+            self._newest_view.cancel()
+        self._newest_text = text
+        self._newest_view = self._submit(partial(self._draw, view, question))
 
     def print(self, what: RenderableType) -> None:
         """Take the screen away and print something that stays."""
-        self.close()
-        self._console.print(what, markup=False, highlight=False)
+        self._submit(partial(self._print, what))
 
     def close(self) -> None:
-        """Give the terminal back."""
+        """Write what waits, however long the terminal takes, and give it back."""
+        self._writer.submit(self._leave)
+        self._writer.shutdown()
+
+    def _submit(self, write: Callable[[], None]) -> Future[None]:
+        before = self._newest
+        if before is not None and before.done() and not before.cancelled():
+            before.result()
+        self._newest = self._writer.submit(write)
+        return self._newest
+
+    # In the thread that writes
+
+    def _draw(self, view: View, question: str) -> None:
+        if self._is_plain:
+            self._say(plain(view, question))
+        else:
+            if view.bells > self._bells:
+                self._console.bell()
+            self._bells = view.bells
+            if self._live is None:
+                self._live = Live(console=self._console, auto_refresh=False, screen=True)
+                self._live.start()
+            size = self._console.size
+            ascii_only = self._console.options.ascii_only
+            self._live.update(screen(view, size.width, size.height, question, ascii_only), refresh=True)
+        self.shown = view
+
+    def _say(self, text: str) -> None:
+        """Print a line, unless it was the last one."""
+        if text != self._last:
+            self._console.print(text, markup=False, highlight=False, soft_wrap=True)
+            self._last = text
+
+    def _print(self, what: RenderableType) -> None:
+        self._leave()
+        self._console.print(what, markup=False, highlight=False)
+
+    def _leave(self) -> None:
         if self._live is not None:
             self._live.stop()
             self._live = None

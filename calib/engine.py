@@ -202,6 +202,27 @@ class Engine:
             self._skip()
         return self._told()
 
+    def reject(self, step_id: str, reason: str) -> tuple[Event, ...]:
+        """Take an accepted step back because its evidence could not be kept; it is asked again.
+
+        Parameters
+        ----------
+        step_id : str
+            An accepted step.
+        reason : str
+            For the operator.
+
+        Returns
+        -------
+        tuple of Event
+            Empty after an abort.
+        """
+        if self._phase is not Phase.ABORTED:
+            del self._accepted[step_id]
+            self._at = next(k for k, step in enumerate(self._steps) if step.id == step_id)
+            self._reject((reason,))
+        return self._told()
+
     @property
     def view(self) -> View:
         """All that a screen shows now."""
@@ -617,6 +638,7 @@ class Engine:
             attempt.aligned.heading_sigma_rad / DEG,
             attempt.heading / DEG,
             (east, north, up),
+            attempt.samples,
         )
         self._logs.append(log)
         self._events.append(self._accepted[step_id])
@@ -711,6 +733,7 @@ class _Attempt:
         self._behind: Records | None = None  # samples behind the alignment's window
         self._segmenter = Segmenter()
         self._navigator: Navigator | None = None
+        self.samples = 0  # since the first one held
         self._first: int | None = None
         self._last = 0
         self._navigated: list[tuple[NDArray[np.int64], Array, Array]] = []
@@ -719,6 +742,7 @@ class _Attempt:
         if self._first is None:
             self._first = int(block.rows["counter"][0])
         self._last = block.last
+        self.samples += len(block.rows)
         self._held.append(block.rows)
         if len(self._held) >= _BLOCKS_A_FLUSH:
             self.flush()

@@ -143,6 +143,9 @@ class Accepted:
         How far the pose was turned clockwise, -180 to 180.
     v_n : tuple of 3 float
         Mean velocity east, north, up in the half second after the turn, m/s.
+    samples : int or None
+        Number of samples of the evidence, less than the counters span where the line lost some; None in the
+        journal of an older version.
     """
 
     step_id: str
@@ -159,11 +162,15 @@ class Accepted:
     heading_sigma_deg: float
     heading_deg: float
     v_n: tuple[float, float, float]
+    samples: int | None = None
 
 
 @dataclass(frozen=True)
 class Rejected:
-    """An attempt, or the preflight (`step_id` is `PREFLIGHT`), cannot serve; each reason bears its number."""
+    """An attempt, or the preflight (`step_id` is `PREFLIGHT`), cannot serve; each reason bears its number.
+
+    It follows `Accepted` of the same attempt where the evidence turned out not to be kept.
+    """
 
     step_id: str
     attempt: int

@@ -6,8 +6,8 @@ will give before anyone lifts anything, and refuses one that does not see the si
 """
 
 from collections import Counter
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Final, Literal, Self
@@ -31,6 +31,8 @@ Array = NDArray[np.float64]
 Side = Literal["+X", "-X", "+Y", "-Y", "+Z", "-Z"]
 """A body axis with its sign: the side of the unit that it points out of."""
 
+VERIFICATION: Final = "verification"
+"""Step id of the rotation after the result."""
 TURN_S: Final = 2.5
 """A rotation by hand from rest to rest, as predictions take it, s."""
 TYPICAL_NOISE: Final = Noise(
@@ -216,6 +218,34 @@ def predicted(
         return predict(plan, site.latitude_rad, noise or TYPICAL_NOISE, priors)
     except InputError as error:
         raise InputError(f"procedure {procedure.name}: {error}") from error
+
+
+def steps_left(procedure: Procedure, done: Collection[str]) -> Procedure:
+    """The procedure of the steps that are not done.
+
+    Parameters
+    ----------
+    procedure : Procedure
+        The whole one.
+    done : collection of str
+        Ids of steps; not all of them.
+
+    Returns
+    -------
+    Procedure
+    """
+    return _with_steps(procedure, [step for step in procedure.steps if step.id not in done])
+
+
+def verification(procedure: Procedure) -> Procedure:
+    """One more rotation, `VERIFICATION`, from where the last one ended."""
+    last = procedure.steps[-1]
+    return _with_steps(procedure, [replace(last, id=VERIFICATION, east=opposite(last.east))])
+
+
+def _with_steps(procedure: Procedure, steps: Sequence[Step]) -> Procedure:
+    poses = tuple(Pose.model_validate(vars(step)) for step in steps)
+    return procedure.model_copy(update={"poses": poses})
 
 
 def shipped() -> list[str]:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.certificate import certificate, software
 from calib.findings import Basis, Findings, Source, Temperature
@@ -34,6 +35,8 @@ from imudrv.wire.layout import Layout
 
 LEFT_S: Final = 0.5
 """Velocity left by a rotation is the mean over so long after it, less that before it."""
+_PUBLISHED_PERIOD: Final = 1 << 32
+"""Of the counter of published increments."""
 _AT_ONCE: Final = 1000
 """Reads of the port that are decoded together: live each brings one sample."""
 
@@ -49,12 +52,15 @@ class Attempt(NamedTuple):
         Its recording.
     first_counter, last_counter : int
         Samples that the verdict rests on, both included, as the service counted them.
+    samples : int or None
+        How many there were; None: not known, as in sessions of an older version.
     """
 
     step: Step
     recording: Path
     first_counter: int
     last_counter: int
+    samples: int | None = None
 
 
 class Result(NamedTuple):
@@ -96,6 +102,7 @@ class _Heard(NamedTuple):
     """What a recording holds of an attempt."""
 
     pulses: Records  # of the evidence
+    counter: NDArray[np.int64]  # of the pulses, as the service counted them
     layout: Layout
     account: Account  # of the whole recording
 
@@ -137,6 +144,43 @@ def identify(procedure: Procedure, attempts: Sequence[Attempt], basis: Basis, si
         software(),
     )
     return Result(findings, certificate(findings, findings.arms))
+
+
+def uncovered(attempt: Attempt) -> str:
+    """Say which samples of an attempt its recording lacks.
+
+    Parameters
+    ----------
+    attempt : Attempt
+        Its recording is closed.
+
+    Returns
+    -------
+    str
+        In plain words, with the counters; empty: all are there.
+
+    Raises
+    ------
+    InputError
+        The recording cannot be read.
+    """
+    return _lacks(attempt, _decoded(attempt))
+
+
+def require_covered(attempt: Attempt) -> None:
+    """Refuse an attempt of which the recording lacks samples.
+
+    Parameters
+    ----------
+    attempt : Attempt
+        An accepted one.
+
+    Raises
+    ------
+    InputError
+        It lacks some, or cannot be read; says which and what to do.
+    """
+    _hear(attempt)
 
 
 def velocity_left(procedure: Procedure, attempt: Attempt, calibration: Calibration, site: Site) -> Left:
@@ -222,7 +266,19 @@ def _collected(
 
 
 def _hear(attempt: Attempt) -> _Heard:
-    """Decode a recording and cut it to the evidence."""
+    """Decode a recording and cut it to the evidence, all of which has to be there."""
+    heard = _decoded(attempt)
+    if lacks := _lacks(attempt, heard):
+        step, folder = attempt.step.id, attempt.recording.parent
+        raise InputError(
+            f"{attempt.recording}: step {step}: {lacks}; do this step again: "
+            f"calib run --session {folder} --redo {step}"
+        )
+    return heard
+
+
+def _decoded(attempt: Attempt) -> _Heard:
+    """Decode a recording and cut it to what there is of the evidence."""
     recording = Recording(attempt.recording)
     layout = recording.profile.layout()
     decoder, accountant = FrameDecoder(layout), Accountant(layout)
@@ -230,16 +286,43 @@ def _hear(attempt: Attempt) -> _Heard:
     pulses.append(accountant.feed(decoder.close()))
     heard = np.concatenate(pulses)
     counter = heard["counter"]
-    if not len(counter):
-        raise InputError(f"{attempt.recording}: expected samples of {layout.name}, got none")
-    # The unit's counter may have gone round since the service began; a recording ends soon after its
-    # evidence.
-    period = 1 << layout.counter_bits
-    counter = counter + round((attempt.last_counter - int(counter[-1])) / period) * period
     backward = np.flatnonzero(np.diff(counter) <= 0)  # the unit restarted before the evidence
     begin = int(backward[-1]) + 1 if len(backward) else 0
-    first, stop = np.searchsorted(counter[begin:], [attempt.first_counter, attempt.last_counter + 1])
-    return _Heard(heard[begin + first : begin + stop], layout, accountant.account)
+    counter = counter[begin:]
+    if len(counter) and not begin:  # at a restart the service, too, begins with the unit's own number
+        counter = counter + _offset(recording, attempt, int(counter[0]), 1 << layout.counter_bits)
+    first, stop = np.searchsorted(counter, [attempt.first_counter, attempt.last_counter + 1])
+    return _Heard(heard[begin + first : begin + stop], counter[first:stop], layout, accountant.account)
+
+
+def _offset(recording: Recording, attempt: Attempt, first: int, period: int) -> int:
+    """What to add to the unit's counter, which may have wrapped before the recording, for the service's."""
+    published = next((int(increments["counter"][0]) for increments in recording.increments()), first)
+    published += _multiple(attempt.last_counter - published, _PUBLISHED_PERIOD)
+    return _multiple(published - first, period)
+
+
+def _multiple(difference: int, period: int) -> int:
+    """Multiple of the period that is nearest to a difference."""
+    return (2 * difference + period) // (2 * period) * period
+
+
+def _lacks(attempt: Attempt, heard: _Heard) -> str:
+    """Name the longest gap in the evidence, unless the line lost these samples.
+
+    Where their number is not known, gaps of up to a block of 20 ms are taken for losses of the line: the
+    engine accepts no longer ones.
+    """
+    edges = np.concatenate([[attempt.first_counter - 1], heard.counter, [attempt.last_counter + 1]])
+    gaps = np.diff(edges) - 1
+    longest = int(gaps.argmax())
+    if attempt.samples is None:
+        is_whole = gaps[longest] <= BLOCK_NS // heard.layout.interval_ns
+    else:
+        is_whole = len(heard.counter) == attempt.samples
+    if is_whole:
+        return ""
+    return f"its recording does not cover counters {edges[longest] + 1}..{edges[longest + 1] - 1}"
 
 
 def _wire(recording: Recording) -> Iterator[bytes | Records]:

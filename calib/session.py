@@ -9,7 +9,8 @@
 ====================  ===================================================================================
 
 The SHA-256 of each file is in the journal once it is closed. A step counts as accepted only when its files
-are in; so whatever happens, what counts can be computed again from what is there.
+are in and its recording has been decoded and found to cover the step's evidence; so whatever happens, what
+counts can be computed again from what is there.
 """
 
 import fcntl
@@ -26,8 +27,8 @@ from calib import journal
 from calib.certificate import FOUND
 from calib.findings import Basis
 from calib.journal import Entry, Journal
-from calib.procedure import Procedure, Step
-from calib.result import Attempt, Result, identify
+from calib.procedure import VERIFICATION, Procedure, Step, verification
+from calib.result import Attempt, Result, identify, require_covered
 from imudrv import config, profiles
 from imudrv.calibration import Calibration, read_calibration, write_calibration
 from imudrv.errors import InputError
@@ -248,6 +249,26 @@ class Session:
         """Steps that need not be asked again, and the lines that accepted them."""
         return _accepted(self.entries)
 
+    def entry(self, event: str) -> Entry | None:
+        """The line of a stage that has been reached and still holds.
+
+        Parameters
+        ----------
+        event : str
+            ``finished``, ``decision`` or ``end``.
+
+        Returns
+        -------
+        dict or None
+            None also after a step of the procedure was withdrawn, see `redo`.
+        """
+        for entry in reversed(self.entries):
+            if _withdraws(entry):
+                return None
+            if entry["event"] == event:
+                return entry
+        return None
+
     @property
     def is_over(self) -> bool:
         """Whether it has come to its end, or its result was turned down."""
@@ -299,6 +320,29 @@ class Session:
         """Number of the next attempt at a step; one that a kill has ended counts."""
         numbers = [path.stem.removeprefix(f"run-{step_id}-") for path in self.folder.glob(f"run-{step_id}-*")]
         return max((int(number) for number in numbers if number.isdecimal()), default=0) + 1
+
+    def redo(self, step_ids: Sequence[str]) -> None:
+        """Withdraw steps, and what was concluded from them, so that they are asked again; files are kept.
+
+        Parameters
+        ----------
+        step_ids : sequence of str
+            Steps of the procedure; once the result is accepted only the verification.
+
+        Raises
+        ------
+        InputError
+            There is no such step; the steps are listed, and none is withdrawn.
+        """
+        if self.entry("decision") is None:
+            known, hint = [step.id for step in self.procedure().steps], ""
+        else:
+            known, hint = [VERIFICATION], "; the result is accepted, for other steps begin another session"
+        for name in step_ids:
+            if name not in known:
+                raise InputError(f"--redo: expected one of {', '.join(known)}, got {name!r}{hint}")
+        for name in step_ids:
+            self.append({"event": "redone", "step_id": name, "attempt": self.attempt(name), "counter": -1})
 
     def enter_leftovers(self) -> list[str]:
         """Enter what an attempt left that a kill or power cut has ended.
@@ -427,7 +471,7 @@ class Session:
 
 
 def verify(folder: Path) -> Verified:
-    """Check a session: the journal's chain, every file's hash, and that the recordings give the certificate.
+    """Check a session: journal, hashes, that recordings cover their steps, that they give the certificate.
 
     Parameters
     ----------
@@ -451,7 +495,7 @@ def verify(folder: Path) -> Verified:
         return Verified((str(error),), ())
     files = _files(entries)
     faults = [f"{folder / JOURNAL}: {torn}"] if torn else []
-    faults += _faulty_files(folder, files)
+    faults += _faulty_files(folder, files) or _uncovered(folder, plan, entries)
     notes = [f"{len(entries)} lines and {len(files)} files checked"]
     unknown = sorted({path.name for path in folder.iterdir() if path.is_file()} - {*files, JOURNAL, _LOCK})
     notes += [f"{folder / name}: not in the journal, not checked" for name in unknown]
@@ -496,8 +540,34 @@ def _accepted(entries: Sequence[Entry]) -> dict[str, Entry]:
 
 
 def _files(entries: Sequence[Entry]) -> dict[str, str]:
-    """Names and hashes of the files."""
-    return {entry["name"]: entry["sha256_of_file"] for entry in entries if entry["event"] == "file"}
+    """Names and hashes of the files that count."""
+    files: dict[str, str] = {}
+    for entry in entries:
+        if entry["event"] == "file":
+            files[entry["name"]] = entry["sha256_of_file"]
+        elif _withdraws(entry):
+            files.pop(RESULT, None)
+    return files
+
+
+def _withdraws(entry: Entry) -> bool:
+    """Whether a line voids what was concluded from the steps before it."""
+    return bool(entry["event"] == "redone" and entry["step_id"] != VERIFICATION)
+
+
+def _uncovered(folder: Path, plan: Plan, entries: Sequence[Entry]) -> list[str]:
+    """Accepted steps whose recordings lack a part of the evidence, a line each."""
+    accepted = _accepted(entries)
+    if not accepted:
+        return []
+    procedure, wrong = _procedure(plan), []
+    for step in (*procedure.steps, *verification(procedure).steps):
+        if step.id in accepted:
+            try:
+                require_covered(_attempt(folder, step, accepted[step.id]))
+            except InputError as error:
+                wrong.append(str(error))
+    return wrong
 
 
 def _faulty_files(folder: Path, files: Mapping[str, str]) -> list[str]:
@@ -541,7 +611,13 @@ def _identify(folder: Path, plan: Plan, entries: Sequence[Entry]) -> Result:
 
 
 def _attempt(folder: Path, step: Step, entry: Entry) -> Attempt:
-    return Attempt(step, folder / entry["recording"], entry["first_counter"], entry["last_counter"])
+    return Attempt(
+        step,
+        folder / entry["recording"],
+        entry["first_counter"],
+        entry["last_counter"],
+        entry.get("samples"),
+    )
 
 
 def _procedure(plan: Plan) -> Procedure:

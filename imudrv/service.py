@@ -35,6 +35,7 @@ from imudrv.records import INCREMENTS, PULSES, Flag
 from imudrv.settings import Settings, default_status_path
 from imudrv.sinks import open_sink
 from imudrv.sinks.base import Batch, Sink
+from imudrv.sinks.history import History
 from imudrv.sinks.recorder import Recorder
 from imudrv.status import Status, StatusServer, health
 from imudrv.units import NS, NS_PER_S
@@ -64,6 +65,8 @@ class Service:
         Called instead of `say` with each event that is a failure.
     in_real_time : bool
         False for a simulated unit at a port, whose rate depends on its speed and is not judged.
+    history : History, optional
+        Filled by the loop, for recordings that begin in the past.
 
     Raises
     ------
@@ -79,6 +82,7 @@ class Service:
         *,
         warn: Callable[[str], None] | None = None,
         in_real_time: bool = True,
+        history: History | None = None,
     ) -> None:
         self._settings = settings
         self._say, self._warn = say, warn or say
@@ -95,7 +99,9 @@ class Service:
         self._pipeline = Pipeline(self._profile, coefficients(self._calibration), self._rates)
         self._latency = Latency(self._layout.interval_ns)
         self._signals = Signals()
-        self._switches: deque[tuple[Path | None, Future[None]]] = deque()
+        self._history = history
+        self._switches: deque[tuple[Path | None, int | None, Future[None]]] = deque()
+        self._has_ended = False
         self._manager = Manager()
         self._notices: list[str] = []
         self._events: list[str] = []
@@ -153,21 +159,27 @@ class Service:
         """State of the line to the unit; for any thread."""
         return self._port_state
 
-    def record(self, path: Path | None) -> Future[None]:
+    def record(self, path: Path | None, since: int | None = None) -> Future[None]:
         """Record into another file, or into none; for any thread.
 
         Parameters
         ----------
         path : Path or None
-            From the next read on. There must be no such file yet.
+            There must be no such file yet.
+        since : int, optional
+            Counter of the sample to begin with, as far back as the history reaches; not given: the next read.
+            The recording before is not shortened: both then have what came meanwhile.
 
         Returns
         -------
         Future
             Done when the recording before is closed; the `InputError` where the new one cannot be made.
+            Cancelled when the service ends first: the recording before is closed then, too.
         """
         done: Future[None] = Future()
-        self._switches.append((path, done))
+        self._switches.append((path, since, done))
+        if self._has_ended:
+            done.cancel()
         return done
 
     def _serve(self) -> None:
@@ -197,6 +209,8 @@ class Service:
                     if len(arrival.data):
                         if self._recorder is not None:
                             self._recorder.arrived(arrival)
+                        if self._history is not None:
+                            self._history.arrived(arrival)
                         sampled = self._pipeline.feed(arrival.data, arrival.t_ns)
                         self._publish(sampled, arrival.t_ns)
                         self._watch.arrived(len(arrival.data), len(sampled.pulses), now_ns())
@@ -215,6 +229,8 @@ class Service:
         batch = Batch(pulses, increments, encode(increments, self._source))
         for sink in self._sinks:
             sink.publish(batch)
+        if self._history is not None:
+            self._history.publish(batch)
         if not len(increments):
             return
         if self._source is not Source.REPLAY:
@@ -308,6 +324,8 @@ class Service:
         self._pipeline.exchange(coefficients(calibration))
         if self._recorder is not None:
             self._recorder.calibration(now_ns(), self._calibration_path.read_bytes())
+        if self._history is not None:
+            self._history.clear()  # a recording begins with one calibration
         self._event(f"calibration exchanged: {sha256[:12]}")
 
     def _calibration_mark(self) -> tuple[int, int, int]:
@@ -329,13 +347,16 @@ class Service:
             self._recorder.event(now, text)
 
     def _switch_recording(self) -> None:
-        path, done = self._switches.popleft()
+        path, since, done = self._switches.popleft()
         before, self._recorder = self._recorder, None
         if path is not None:
             try:
                 self._recorder = self._open_recorder(path)
             except InputError as error:
                 done.set_exception(error)
+            else:
+                if since is not None and self._history is not None:
+                    self._recorder.catch_up(self._history.since(since))
 
         def close() -> None:
             if before is not None:
@@ -368,8 +389,9 @@ class Service:
         self._refresh(now_ns())
         if self._recorder is not None:
             self._recorder.close()
-        for _, done in self._switches:
-            done.cancel()
+        self._has_ended = True
+        while self._switches:
+            self._switches.popleft()[-1].cancel()
         self._open.close()
 
     # What it tells

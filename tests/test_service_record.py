@@ -7,13 +7,17 @@ from time import sleep
 import numpy as np
 import pytest
 
-from imudrv.calibration import write_calibration
+from imudrv.calibration import coefficients, write_calibration
 from imudrv.errors import InputError
+from imudrv.imu.rate_filter import rate_filter
+from imudrv.pipeline import Pipeline
 from imudrv.recording import Recording
+from imudrv.records import Flag, Records
 from imudrv.service import Service
 from imudrv.settings import Settings
 from imudrv.sim.scenario import NOMINAL
 from imudrv.sinks.base import Batch, Sink, SinkState
+from imudrv.sinks.history import History
 
 DEADLINE_S = 60.0
 
@@ -80,6 +84,83 @@ def test_one_recording_follows_another_between_two_reads_and_nothing_is_lost_bet
     assert "expected a new file" in str(error)
 
 
+def replayed(recording: Recording) -> Records:
+    """Increments that the wire of a recording gives."""
+    pipeline = Pipeline(recording.profile, coefficients(NOMINAL), rate_filter("causal", 1_000_000))
+    increments = [pipeline.feed(arrival.data, arrival.t_ns).increments for arrival in recording.arrivals()]
+    return np.concatenate([*increments, pipeline.close().increments])
+
+
+@pytest.mark.parametrize("keeps", [True, False])
+def test_a_recording_begins_at_a_sample_that_is_past_where_there_is_a_history(
+    tmp_path: Path, keeps: bool
+) -> None:
+    write_calibration(tmp_path / "unit.yaml", NOMINAL)
+    settings = Settings(
+        port="sim://rocking?speed=20",
+        profile="imu50-rs422",
+        calibration=str(tmp_path / "unit.yaml"),
+        status=str(tmp_path / "socket"),
+    )
+    own = Counted()
+    service = Service(settings, lambda _: None, [own], history=History() if keeps else None)
+
+    def ask() -> None:
+        wait_for(own, 3000)
+        service.record(tmp_path / "past.mcap", since=1000).result(DEADLINE_S)
+        wait_for(own, 1000)
+        service.record(None).result(DEADLINE_S)
+        service.stop()
+
+    asking = Thread(target=ask)
+    asking.start()
+    service.run()
+    asking.join(DEADLINE_S)
+    recording = Recording(tmp_path / "past.mcap")
+    published, again = np.concatenate(list(recording.increments())), replayed(recording)
+    assert (np.diff(published["counter"]) == 1).all()
+    assert published["counter"][-1] > 3500
+    if not keeps:
+        assert published["counter"][0] > 2500
+        return
+    assert published["counter"][0] <= 1000
+    assert np.array_equal(again["counter"], published["counter"])
+    whole = again["flags"] & Flag.SIZE_EFFECT != 0  # before the first of these rates are not known
+    assert whole[5:].all()
+    for name in ("interval_ns", "dtheta_b", "dv_b"):
+        assert np.array_equal(again[name][whole], published[name][whole])
+
+
+def test_after_an_exchange_of_the_calibration_a_recording_begins_with_the_new_one(tmp_path: Path) -> None:
+    write_calibration(tmp_path / "unit.yaml", NOMINAL)
+    settings = Settings(
+        port="sim://static?speed=20",
+        profile="imu50-rs422",
+        calibration=str(tmp_path / "unit.yaml"),
+        status=str(tmp_path / "socket"),
+    )
+    own, said = Counted(), list[str]()
+    service = Service(settings, said.append, [own], history=History())
+
+    def ask() -> None:
+        wait_for(own, 3000)
+        write_calibration(tmp_path / "unit.yaml", NOMINAL.model_copy(update={"size_effect": None}))
+        while not any("calibration exchanged" in text for text in said):
+            wait_for(own, 10)
+        service.record(tmp_path / "past.mcap", since=1000).result(DEADLINE_S)
+        wait_for(own, 1000)
+        service.stop()
+
+    asking = Thread(target=ask)
+    asking.start()
+    service.run()
+    asking.join(DEADLINE_S)
+    recording = Recording(tmp_path / "past.mcap")
+    assert next(recording.increments())["counter"][0] > 3000
+    assert recording.calibration is not None
+    assert recording.calibration.size_effect is None
+
+
 def wait_for(own: Counted, more: int) -> None:
     begun = own.samples
     while own.samples < begun + more:
@@ -99,5 +180,6 @@ def test_a_request_that_the_end_overtakes_is_given_up(tmp_path: Path) -> None:
     request = service.record(tmp_path / "late.mcap")
     service.run()
     assert request.cancelled()
+    assert service.record(tmp_path / "later.mcap").cancelled()
     with pytest.raises(InputError, match="cannot read it"):
         Recording(tmp_path / "late.mcap")

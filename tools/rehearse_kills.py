@@ -2,6 +2,8 @@
 
     python tools/rehearse_kills.py [--kills 30] [--seed 1] [FOLDER]
 
+Every third time it runs at a terminal that takes no output, as after Ctrl-S.
+
 At the end the session has to verify, no accepted step may have been asked again, no sample logged twice, and
 the result must be that of an undisturbed rehearsal within three sigma of their difference.
 """
@@ -9,11 +11,13 @@ the result must be that of an undisturbed rehearsal within three sigma of their 
 import argparse
 import json
 import os
+import pty
 import random
 import subprocess
 import sys
 import tempfile
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
 
@@ -48,7 +52,7 @@ def main() -> int:
     disturbed = []
     while kills < arguments.kills:
         lived = moments.uniform(*PAUSE_S)
-        if rehearse(killed, lived):
+        if rehearse(killed, lived, is_stopped=kills % 3 == 1):
             disturbed.append(killed)
             sessions += 1
             killed = folder / f"killed-{sessions}"
@@ -64,11 +68,20 @@ def main() -> int:
     return 1 if faults else 0
 
 
-def rehearse(folder: Path, longest_s: float | None = None) -> bool:
-    """Rehearse, or go on with it; whether it came to its end in time."""
-    with open(os.devnull) as nothing, open(f"{folder}.log", "a") as log:
+def rehearse(folder: Path, longest_s: float | None = None, is_stopped: bool = False) -> bool:
+    """Rehearse, or go on with it, into a log or a stopped terminal; whether it came to its end in time."""
+    with ExitStack() as opened:
+        output: Any = opened.enter_context(open(f"{folder}.log", "a"))
+        if is_stopped:
+            master, output = pty.openpty()
+            for end in (master, output):
+                opened.callback(os.close, end)
         process = subprocess.Popen(
-            [sys.executable, "-c", RUN, str(folder)], stdin=nothing, stdout=log, stderr=log
+            [sys.executable, "-c", RUN, str(folder)],
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=output,
+            env={**os.environ, "TERM": "xterm"},
         )
         try:
             process.wait(longest_s)

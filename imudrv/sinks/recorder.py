@@ -7,7 +7,7 @@ chunked nor compressed, for a chunk would hold data back; `imudrv.recording.pack
 import json
 import struct
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from hashlib import sha256
 from importlib.metadata import version
@@ -24,6 +24,7 @@ from imudrv.hostclock import now_ns
 from imudrv.ports.base import Arrival
 from imudrv.recording import pack_messages
 from imudrv.sinks.base import Batch, SinkState
+from imudrv.sinks.history import Moment
 from imudrv.sinks.spool import Piece, Spool
 from imudrv.wire.datagram import SIZE, Source
 from imudrv.wire.layout import Layout
@@ -111,6 +112,19 @@ class Recorder:
         """Take in a batch."""
         self._put += len(batch.datagrams) // SIZE
         self._datagrams.put(batch.datagrams)
+
+    def catch_up(self, moments: Sequence[Moment]) -> None:
+        """Take in what was already past when the recording was asked for; to be called before the rest.
+
+        Parameters
+        ----------
+        moments : sequence of Moment
+            From a `History`.
+        """
+        datagrams = [moment.datagrams for moment in moments if moment.datagrams]
+        self._put += sum(map(len, datagrams)) // SIZE
+        self._wire.extend([moment.arrival for moment in moments])
+        self._datagrams.extend(datagrams)
 
     def status(self, status: Mapping[str, object]) -> None:
         """Take in how the service is.
@@ -251,6 +265,15 @@ class _Queue(Generic[T]):
         """Append, by the loop; drop the oldest of what is too much."""
         self._items.append(item)
         self._put += self._size(item) + _OVERHEAD
+        self._drop()
+
+    def extend(self, items: Sequence[T]) -> None:
+        """Append many at once, by the loop; drop the oldest of what is too much."""
+        self._items.extend(items)
+        self._put += sum(map(self._size, items)) + _OVERHEAD * len(items)
+        self._drop()
+
+    def _drop(self) -> None:
         with suppress(IndexError):
             while self._put - self._taken - self.dropped_size - self.dropped * _OVERHEAD > QUEUE_BYTES:
                 self.dropped_size += self._size(self._items.popleft())

@@ -1,6 +1,7 @@
-"""Ideal increments of a unit that rests and turns on a bench, with white noise."""
+"""Ideal increments of a unit that rests and turns on a bench, with white noise; and recordings of samples."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -8,10 +9,16 @@ import pytest
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation as Attitude
 
+from imudrv import profiles
 from imudrv.nav.earth import earth_rate_n, normal_gravity
-from imudrv.records import INCREMENTS, Flag, Records
+from imudrv.ports.base import Arrival
+from imudrv.records import INCREMENTS, PULSES, Flag, Records
+from imudrv.sinks.base import Batch
+from imudrv.sinks.recorder import Recorder
 from imudrv.site import Site
 from imudrv.units import DEG, NS
+from imudrv.wire.datagram import Source, encode
+from imudrv.wire.encode import StreamEncoder
 
 Array = NDArray[np.float64]
 
@@ -87,3 +94,39 @@ def step() -> type[Step]:
 def site() -> Site:
     """Where the bench stands."""
     return SITE
+
+
+READ = 500
+"""Samples of a read."""
+
+
+def record(path: Path, counters: Iterable[int], profile: str = "imu50-rs422") -> Path:
+    """Make a recording of samples at rest; counters as the service counts them."""
+    layout = profiles.load(profile).layout()
+    counter = np.array(list(counters))
+    recorder = Recorder(
+        path,
+        layout=layout,
+        profile=profiles.content(profile),
+        calibration=None,
+        source=Source.SIMULATOR,
+        port="nowhere",
+        unit="nominal",
+    )
+    encoder = StreamEncoder(layout)
+    for at in range(0, len(counter), READ):
+        pulses = np.zeros(len(counter[at : at + READ]), PULSES)
+        increments = np.zeros(len(pulses), INCREMENTS)
+        increments["counter"] = counter[at : at + READ]
+        pulses["counter"] = increments["counter"] % (1 << layout.counter_bits)
+        pulses["temperature_degc"] = 35.0
+        recorder.arrived(Arrival(at, encoder.encode(pulses).tobytes()))
+        recorder.publish(Batch(pulses, increments, encode(increments, Source.SIMULATOR)))
+    recorder.close()
+    return path
+
+
+@pytest.fixture(scope="session")
+def recorded() -> Callable[..., Path]:
+    """Makes recordings; see `record`."""
+    return record

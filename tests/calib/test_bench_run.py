@@ -27,7 +27,10 @@ from imudrv import config
 from imudrv.calibration import SizeEffect, read_calibration, write_calibration
 from imudrv.config import sha256
 from imudrv.errors import InputError
+from imudrv.recording import Recording
 from imudrv.sim.scenario import NOMINAL
+from imudrv.sinks.recorder import Recorder
+from imudrv.wire.datagram import Source
 
 # The alignment is short: of what follows from it, heading and biases, the joint estimate finds most anew.
 PROCEDURE = """
@@ -49,19 +52,24 @@ from pathlib import Path
 from rich.console import Console
 from calib.bench import run
 from imudrv.console import guarded
-procedure, folder = sys.argv[1:]
+procedure, folder, *redo = sys.argv[1:]
 sys.exit(guarded(lambda: run(
-    procedure=procedure, folder=Path(folder), rehearse=True, speed="max", console=Console(width=200)
+    procedure=procedure,
+    folder=Path(folder),
+    rehearse=True,
+    speed="max",
+    redo=redo,
+    console=Console(width=200),
 )))
 """
 
 
-def start(folder: Path) -> subprocess.Popen[str]:
+def start(folder: Path, *redo: str) -> subprocess.Popen[str]:
     """Begin a rehearsal, or go on with it."""
     procedure = folder.parent / "short.yaml"
     procedure.write_text(PROCEDURE)
     return subprocess.Popen(
-        [sys.executable, "-c", RUN, str(procedure), str(folder)],
+        [sys.executable, "-c", RUN, str(procedure), str(folder), *redo],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -227,24 +235,82 @@ def test_a_certificate_that_the_recordings_do_not_give_is_named_though_every_has
     r_x = f"{size_effect(folder).r_mm.x[0]}"
     (forged / "certificate.yaml").unlink()
     (forged / "certificate.yaml").write_text(certificate.replace(r_x, f"{r_x}1", 1))
-    lines = (forged / JOURNAL).read_text().splitlines()
-    (forged / JOURNAL).unlink()
-    rewritten = [
-        {**json.loads(line), **({"sha256_of_file": sha256(forged / "certificate.yaml")} if ok else {})}
-        for line in lines
-        for ok in ['"name": "certificate.yaml"' in line]
-    ]
-    for number, entry in enumerate(rewritten):
-        entry.pop("before")
-        entry.pop("sha256")
+    rewrite(forged, lambda entry: None)
+    (fault,) = verify(forged).faults
+    assert fault.startswith(f"{forged / 'certificate.yaml'}: expected what the recordings give")
+
+
+def rewrite(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Forge a journal: change its entries, and give every file the hash that it has now."""
+    entries = journal(folder)
+    (folder / JOURNAL).unlink()
+    for number, entry in enumerate(entries):
+        for key in ("before", "sha256"):
+            entry.pop(key)
+        if entry["event"] == "file":
+            entry["sha256_of_file"] = sha256(folder / entry["name"])
+        change(entry)
         if number == 0:
-            begin(forged / JOURNAL, entry)
-            forger = Journal(forged / JOURNAL)
+            begin(folder / JOURNAL, entry)
+            forger = Journal(folder / JOURNAL)
         else:
             forger.append(entry)
     forger.close()
-    (fault,) = verify(forged).faults
-    assert fault.startswith(f"{forged / 'certificate.yaml'}: expected what the recordings give")
+
+
+def test_a_step_with_a_hole_in_its_recording_is_done_again_alone_and_the_session_ends_well(
+    tmp_path: Path,
+) -> None:
+    folder = tmp_path / "holed"
+    process = start(folder)
+    until(process, lambda: "y-up" in accepted_in(folder))
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=DEADLINE_S)
+    assert accepted_in(folder) == STEPS
+    # A session of the first version: it began to record x-up when half of the alignment was over.
+    path = folder / "run-x-up-1.mcap"
+    arrivals = list(Recording(path).arrivals())
+    profile = Recording(path).profile_text.encode()
+    path.unlink()
+    late = Recorder(
+        path,
+        layout=Recording(folder / "run-z-up-1.mcap").profile.layout(),
+        profile=profile,
+        calibration=None,
+        source=Source.SIMULATOR,
+        port="",
+        unit="",
+    )
+    for arrival in arrivals[len(arrivals) // 3 :]:
+        late.arrived(arrival)
+    late.close()
+    rewrite(folder, lambda entry: entry.pop("samples", None))
+
+    (fault,) = verify(folder).faults
+    assert "run-x-up-1.mcap: step x-up: its recording does not cover counters" in fault
+    assert f"calib run --session {folder} --redo x-up" in fault
+    process = start(folder)
+    _, err = process.communicate(timeout=DEADLINE_S)
+    assert process.returncode == 2
+    assert f"calib run --session {folder} --redo x-up" in err
+
+    ended(start(folder, "x-up"))
+    asked = [(e["step_id"], e["attempt"]) for e in journal(folder) if e.get("phase") == "place"]
+    assert asked == [("z-up", 1), ("x-up", 1), ("y-up", 1), ("x-up", 2), ("verification", 1)]
+    assert verify(folder).faults == ()
+    assert "run-x-up-1.mcap" in [entry.get("name") for entry in journal(folder)]
+    check_true(folder)
+
+
+def accepted_in(folder: Path) -> list[str]:
+    return [entry["step_id"] for entry in journal(folder) if entry["event"] == "accepted"]
+
+
+def test_only_a_session_that_is_there_can_be_done_again_in_part(tmp_path: Path) -> None:
+    with pytest.raises(
+        InputError, match="--redo: expected a session that is there, with --session, got none"
+    ):
+        bench.run(folder=tmp_path / "new", rehearse=True, redo=["z-up"], console=Console())
 
 
 def test_a_counter_that_went_round_before_the_recording_makes_no_difference(

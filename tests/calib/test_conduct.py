@@ -1,9 +1,12 @@
 """The worker between engine, session and operator, with samples from a queue instead of a unit."""
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from io import StringIO
 from pathlib import Path
+from threading import Thread
+from time import sleep
 from typing import Any
 
 import numpy as np
@@ -11,20 +14,31 @@ import pytest
 from rich.console import Console
 
 from calib import conduct as conducts
-from calib.conduct import Conduct, Tap, steps_left
-from calib.console import Keys, Screen
-from calib.procedure import Procedure
+from calib.conduct import Conduct, Tap
+from calib.console import Keys, Screen, plain
+from calib.events import View
+from calib.procedure import Procedure, steps_left
 from calib.rehearsal import BENCH, Mistake, technician
 from calib.session import Document, Session, verify
 from imudrv import config, profiles
 from imudrv.calibration import coefficients, write_calibration
 from imudrv.diagnosis import LineState
 from imudrv.errors import InputError
+from imudrv.imu.accounting import Accountant
 from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import rate_filter
-from imudrv.sim.scenario import NOMINAL
+from imudrv.ports.base import Arrival
+from imudrv.recording import Recording
+from imudrv.service import Service
+from imudrv.settings import Settings
+from imudrv.sim.scenario import NOMINAL, Rest, Scenario, Segment
 from imudrv.sim.unit import simulate
 from imudrv.sinks.base import Batch
+from imudrv.sinks.history import MAX_BYTES, History
+from imudrv.sinks.recorder import Recorder
+from imudrv.wire.datagram import Source, encode
+from imudrv.wire.decoder import FrameDecoder
+from imudrv.wire.encode import StreamEncoder
 
 LAYOUT = profiles.load("imu50-rs422").layout()
 ONE = """
@@ -38,23 +52,42 @@ poses: [{id: z-up, up: +Z, east: +X, turn_deg: 180}]
 PROCEDURE = config.parse_text(ONE.encode(), Procedure, "one.yaml")
 
 
-class Recorder:
-    """In the place of the service: a recording is a file, and closed at once."""
+class Line:
+    """In the place of the service, whose unit has sent everything already: records it from its history."""
 
-    def __init__(self) -> None:
+    def __init__(self, history: History) -> None:
         self.stopped = False
         self.states: list[LineState] = []
+        self.dropped = range(0)
+        self._history = history
+        self._encoder = StreamEncoder(LAYOUT)
 
     @property
     def port_state(self) -> LineState:
         """The next state at each look; at last nothing is wrong."""
         return self.states.pop(0) if self.states else LineState("streaming")
 
-    def record(self, path: Path | None) -> Future[None]:
+    def publish(self, batch: Batch) -> None:
+        wire = self._encoder.encode(batch.pulses).tobytes()
+        self._history.arrived(Arrival(int(batch.pulses["elapsed_ns"][-1]), wire))
+        self._history.publish(batch)
+
+    def record(self, path: Path | None, since: int = 0) -> Future[None]:
+        if path is not None:
+            recorder = Recorder(
+                path,
+                layout=LAYOUT,
+                profile=profiles.content("imu50-rs422"),
+                calibration=None,
+                source=Source.SIMULATOR,
+                port="nowhere",
+                unit="nominal",
+            )
+            recorder.catch_up([m for m in self._history.since(since) if m.first not in self.dropped])
+            recorder.close()
+            self.dropped = range(0)
         done: Future[None] = Future()
         done.set_result(None)
-        if path is not None:
-            path.write_bytes(b"recording")
         return done
 
     def stop(self) -> None:
@@ -74,20 +107,21 @@ class Typed(Keys):
 
 
 class Shown(Screen):
-    """A screen that the fingers see."""
+    """A screen that the fingers see at once."""
 
     def __init__(self, keys: Typed) -> None:
         self.text = StringIO()
         super().__init__(Console(file=self.text, width=200))
         self._fingers = keys
 
-    def say(self, text: str) -> None:
-        self._fingers.seen = text
-        super().say(text)
+    def show(self, view: View, question: str = "") -> None:
+        super().show(view, question)
+        while not self.is_idle:
+            sleep(0.001)
+        self._fingers.seen = plain(view, question)
 
 
-@pytest.fixture(scope="module")
-def batches() -> list[Batch]:
+def performed(scenario: Scenario) -> list[Batch]:
     """A technician's samples, in pieces of a fifth of a second."""
     compensator = Compensator(
         coefficients(NOMINAL.model_copy(update={"size_effect": None})),
@@ -95,11 +129,17 @@ def batches() -> list[Batch]:
         rate_filter("causal", LAYOUT.interval_ns),
     )
     made = []
-    for chunk in simulate(technician(PROCEDURE, calibration=NOMINAL), LAYOUT.interval_ns):
+    for chunk in simulate(scenario, LAYOUT.interval_ns):
         for begin in range(0, len(chunk.pulses), 200):
             pulses = chunk.pulses[begin : begin + 200]
-            made.append(Batch(pulses, compensator.feed(pulses), b""))
+            increments = compensator.feed(pulses)
+            made.append(Batch(pulses, increments, encode(increments, Source.SIMULATOR)))
     return made
+
+
+@pytest.fixture(scope="module")
+def batches() -> list[Batch]:
+    return performed(technician(PROCEDURE, calibration=NOMINAL))
 
 
 @pytest.fixture
@@ -125,16 +165,24 @@ def conducted(
     *,
     hands_free: bool = True,
     stopped: bool = True,
+    history_bytes: int = MAX_BYTES,
+    dropped: range = range(0),
     port_states: Sequence[LineState] = (),
 ) -> tuple[Conduct, str]:
-    """Work through items, behind which nothing comes; `stopped`: the service ended before they were taken."""
-    tap, recorder, keys = Tap(None), Recorder(), keys or Typed()
-    recorder.states += port_states
+    """Work through items, behind which nothing comes; `stopped`: the service ended before they were taken.
+
+    All of them have passed before the worker begins: it is as late as it can be. `dropped`: samples that the
+    first recording lacks.
+    """
+    tap, line, keys = Tap(None), Line(History(history_bytes)), keys or Typed()
+    line.dropped = dropped
+    line.states += port_states
     for item in items:
         if isinstance(item, str):
             tap.tell(item)
         else:
             tap.publish(item)
+            line.publish(item)
     tap.close()
     tap.is_closed = stopped
     screen = Shown(keys)
@@ -142,7 +190,7 @@ def conducted(
         session,
         PROCEDURE,
         LAYOUT,
-        recorder,  # type: ignore[arg-type]
+        line,  # type: ignore[arg-type]
         tap,
         screen,
         keys,
@@ -150,7 +198,7 @@ def conducted(
         begin=lambda _: None,
     )
     conduct.run()
-    assert recorder.stopped
+    assert line.stopped
     return conduct, screen.text.getvalue()
 
 
@@ -217,15 +265,8 @@ def test_what_the_service_says_of_the_port_is_shown_and_journaled(
 
 
 def test_a_mistake_is_journaled_with_its_reasons_and_its_evidence_kept(session: Session) -> None:
-    compensator = Compensator(
-        coefficients(session.calibration()), LAYOUT, rate_filter("causal", LAYOUT.interval_ns)
-    )
     scenario = technician(PROCEDURE, [Mistake("z-up", "short")], calibration=NOMINAL)
-    items: list[Batch | str] = [
-        Batch(chunk.pulses, compensator.feed(chunk.pulses), b"")
-        for chunk in simulate(scenario, LAYOUT.interval_ns, 500)
-    ]
-    _, text = conducted(session, items)
+    _, text = conducted(session, performed(scenario))
     (rejected,) = (entry for entry in session.entries if entry["event"] == "rejected")
     assert "turned 150" in rejected["reasons"][0]
     assert "turned 150" in text
@@ -233,6 +274,97 @@ def test_a_mistake_is_journaled_with_its_reasons_and_its_evidence_kept(session: 
     before = session.entries[session.entries.index(rejected) - 1]
     assert before["name"] == "run-z-up-1.mcap"  # it ends with the verdict
     assert "run-z-up-2.mcap" in session.files
+
+
+# A worker that is late
+
+
+def test_a_recording_begins_where_the_engine_asked_for_the_unit_to_be_placed(
+    session: Session, batches: list[Batch]
+) -> None:
+    conducted(session, list(batches))
+    placed = next(e for e in session.entries if e["event"] == "entered" and e["phase"] == "place")
+    recording = Recording(session.folder / "run-z-up-1.mcap")
+    decoder, accountant = FrameDecoder(LAYOUT), Accountant(LAYOUT)
+    pulses = accountant.feed(decoder.feed(b"".join(bytes(a.data) for a in recording.arrivals())))
+    published = np.concatenate(list(recording.increments()))["counter"]
+    # two batches of 200 samples in front of that one
+    assert placed["counter"] - 600 < pulses["counter"][0] <= placed["counter"]
+    assert (np.diff(pulses["counter"]) == 1).all()
+    assert np.array_equal(published, pulses["counter"])
+
+
+@pytest.mark.parametrize("history_bytes", [1 << 20, 4 << 20])
+def test_where_the_history_does_not_reach_back_the_step_is_asked_again_with_the_reason(
+    session: Session, batches: list[Batch], history_bytes: int
+) -> None:
+    _, text = conducted(session, list(batches), history_bytes=history_bytes)
+    assert session.accepted == {}
+    (rejected,) = (entry for entry in session.entries if entry["event"] == "rejected")
+    (reason,) = rejected["reasons"]
+    assert re.match(r"its recording does not cover counters \d+\.\.\d+: this computer", reason)
+    assert reason in text
+    assert "GOOD" not in text
+    asked = [e["attempt"] for e in session.entries if e.get("phase") == "place"]
+    assert asked == [1, 2]
+    assert "run-z-up-1.mcap" in session.files
+    assert verify(session.folder).faults == ()
+
+
+def test_a_step_whose_recording_has_a_hole_is_done_again_and_then_counts(session: Session) -> None:
+    pose = ONE[ONE.index("{id") : ONE.index("]")]
+    twice = ONE.replace(pose, f"{pose}, {pose.replace('z-up', 'again')}")
+    procedure = config.parse_text(twice.encode(), Procedure, "twice.yaml")
+    batches = performed(technician(procedure, calibration=NOMINAL))
+    aligning = int(batches[250].pulses["counter"][0])
+    conducted(session, list(batches), dropped=range(aligning, aligning + 200))
+    (rejected,) = (entry for entry in session.entries if entry["event"] == "rejected")
+    assert f"does not cover counters {aligning}..{aligning + 199}" in rejected["reasons"][0]
+    assert session.accepted["z-up"]["recording"] == "run-z-up-2.mcap"
+    assert verify(session.folder).faults == ()
+
+
+def test_a_key_refers_to_the_view_that_the_operator_sees(
+    session: Session, batches: list[Batch], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(conducts, "SHOWN_S", 0.0)
+    monkeypatch.setattr(Shown, "show", lambda *_: None)  # the terminal is stopped
+    conducted(session, list(batches), Typed(lambda _: "\n"), hands_free=False)
+    assert not [entry for entry in session.entries if entry.get("phase") == "settle"]
+
+
+def test_evidence_is_whole_though_the_worker_is_held_up_for_as_long_as_a_step_takes(
+    session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done = technician(PROCEDURE, calibration=NOMINAL)
+    stays = Segment(rest=Rest(duration_s=1000.0))
+    config.write(tmp_path / "technician.yaml", done.model_copy(update={"motion": (*done.motion, stays)}))
+    settings = Settings(
+        port=f"sim://{tmp_path / 'technician.yaml'}?speed=20",
+        profile="imu50-rs422",
+        calibration=str(session.folder / "working.yaml"),
+        status=str(tmp_path / "socket"),
+    )
+    append, tap, keys = session.append, Tap(None), Typed()
+
+    def held_up(entry: dict[str, Any]) -> None:
+        append(entry)
+        while entry.get("phase") == "preflight" and tap.state.queued < 70_000:  # its alignment is over
+            sleep(0.01)
+
+    monkeypatch.setattr(session, "append", held_up)
+    service = Service(settings, lambda _: None, [tap], history=History())
+    conduct = Conduct(
+        session, PROCEDURE, LAYOUT, service, tap, Shown(keys), keys, hands_free=True, begin=lambda _: None
+    )
+    worker = Thread(target=conduct.run)
+    worker.start()
+    service.run()
+    tap.close()
+    worker.join()
+    assert "expected rotations that see 6 directions" in str(conduct.error)
+    assert list(session.accepted) == ["z-up"]
+    assert verify(session.folder).faults == ()
 
 
 # Resumed

@@ -4,8 +4,10 @@ import os
 import pty
 import sys
 import termios
+import time
 from collections.abc import Iterator
 from io import StringIO
+from threading import Event
 from typing import Any
 
 import pytest
@@ -16,6 +18,7 @@ from calib.console import UNHEARD, UNREADABLE, Keys, Screen, plain, screen, with
 from calib.events import Abort, Confirm, Phase, Redo, Skip, View
 from imudrv.diagnosis import LineState
 
+DEADLINE_S = 20.0
 LONG = (
     "gravity reads 9.203 m/s^2 where 9.792 +- 0.02 is expected: check the accelerometers' scale factors",
     "the readings are those of a unit whose accelerometers X and Y are exchanged, or of another pose",
@@ -181,7 +184,9 @@ def test_without_a_terminal_each_change_is_a_line() -> None:
 def test_a_dumb_terminal_gets_lines_too(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TERM", "dumb")
     out = StringIO()
-    Screen(Console(file=out, force_terminal=True, width=80)).show(view())
+    shown = Screen(Console(file=out, force_terminal=True, width=80))
+    shown.show(view())
+    shown.close()
     assert out.getvalue() == plain(view()) + "\n"
 
 
@@ -191,8 +196,84 @@ def test_the_bell_rings_when_bells_grow(monkeypatch: pytest.MonkeyPatch) -> None
     shown = Screen(Console(file=out, force_terminal=True, width=80, height=24))
     for bells in (0, 1, 1, 2):
         shown.show(view(bells=bells))
+        written(shown)
     shown.close()
     assert out.getvalue().count("\a") == 2
+
+
+def written(shown: Screen) -> None:
+    """Wait until a screen has written everything."""
+    end = time.monotonic() + DEADLINE_S
+    while not shown.is_idle:
+        assert time.monotonic() < end
+        time.sleep(0.001)
+
+
+class Stopped(StringIO):
+    """A terminal that takes nothing until it runs again."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.runs = Event()
+        self.waits = Event()
+
+    def write(self, text: str) -> int:
+        self.waits.set()
+        assert self.runs.wait(DEADLINE_S)
+        return super().write(text)
+
+
+def test_nobody_waits_for_a_stopped_terminal_and_then_only_the_newest_view_is_drawn(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("TERM", "xterm-256color")
+    out = Stopped()
+    shown = Screen(Console(file=out, force_terminal=True, width=80, height=24))
+    shown.show(view(title="first"))
+    assert out.waits.wait(DEADLINE_S)
+    for k in range(1000):
+        shown.show(view(title=f"view {k}"))
+    assert shown.shown is None
+    assert not shown.is_idle
+    out.runs.set()
+    written(shown)
+    assert shown.shown == view(title="view 999")
+    shown.close()
+    assert "first" in out.getvalue()
+    assert "view 999" in out.getvalue()
+    assert "view 998" not in out.getvalue()
+
+
+def test_what_is_printed_and_plain_lines_wait_in_order_for_a_stopped_reader() -> None:
+    out = Stopped()
+    shown = Screen(Console(file=out, width=80))
+    for k in range(3):
+        shown.show(view(title=f"view {k}"))
+    shown.print("the result")
+    shown.show(view(title="view 3"))
+    out.runs.set()
+    shown.close()
+    lines = out.getvalue().splitlines()
+    assert [line.partition(" |")[0] for line in lines] == [
+        "view 0",
+        "view 1",
+        "view 2",
+        "the result",
+        "view 3",
+    ]
+
+
+def test_a_terminal_that_is_gone_is_an_error_at_the_next_view() -> None:
+    class Gone(StringIO):
+        def write(self, text: str) -> int:
+            raise OSError("gone")
+
+    shown = Screen(Console(file=Gone(), width=80))
+    shown.show(view(title="first"))
+    written(shown)
+    with pytest.raises(OSError, match="gone"):
+        shown.show(view(title="second"))
+    shown.close()
 
 
 class Terminal:

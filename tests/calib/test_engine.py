@@ -368,6 +368,45 @@ def test_a_session_that_is_resumed_asks_no_accepted_step_again_and_counts_attemp
     assert [type(e) for e in done.events] == [Entered, Finished]
 
 
+@pytest.mark.parametrize("poses", [(Z,), (Z, X)], ids=["all is done", "in the next step"])
+def test_an_accepted_step_whose_evidence_was_not_kept_is_asked_again(
+    drive: Drive, turned: Records, poses: tuple[dict[str, Any], ...]
+) -> None:
+    driver = drive(*poses).feed(turned)
+    newest = int(turned["counter"][-1])
+
+    rejected, entered = driver.engine.reject("z", "the disk is full")
+
+    assert isinstance(rejected, Rejected)
+    assert (rejected.step_id, rejected.attempt) == ("z", 1)
+    assert entered.phase is Phase.VERDICT
+    assert driver.engine.accepted == {}
+    assert driver.engine.view.headline == "REJECTED: DO IT AGAIN"
+    assert driver.engine.view.reasons == ("the disk is full",)
+    rest = np.tile(turned[-1000:], 3)  # 6 s: the verdict has been shown
+    rest["counter"] = newest + 1 + np.arange(len(rest))
+    driver.feed(rest)
+    placed = [(e.step_id, e.attempt) for e in driver.of(Entered) if e.phase is Phase.PLACE]
+    assert placed == [("z", 1), *[("x", 1) for _ in poses[1:]], ("z", 2)]
+    assert driver.engine.view.reasons == ("the disk is full",)
+
+
+def test_after_an_abort_nothing_is_asked_again(drive: Drive, turned: Records) -> None:
+    driver = drive(Z, X).feed(turned)
+    driver.act(Abort())
+    assert driver.engine.reject("z", "the disk is full") == ()
+
+
+def test_the_samples_of_the_evidence_are_counted_and_lost_ones_are_not(drive: Drive, turned: Records) -> None:
+    (whole,) = drive().feed(turned).of(Accepted)
+    lost = np.arange(19_000, 31_000, 500)
+    (holed,) = drive().feed(np.delete(turned, lost)).of(Accepted)
+    counter = np.delete(turned["counter"], lost)
+    assert whole.samples == whole.last_counter - whole.first_counter + 1
+    assert holed.samples == ((counter >= holed.first_counter) & (counter <= holed.last_counter)).sum()
+    assert holed.samples < whole.samples
+
+
 # Nothing runs out
 
 

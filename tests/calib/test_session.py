@@ -1,7 +1,7 @@
 """The session's folder: nothing in it can be lost, doubled or changed unseen."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,13 @@ from imudrv.sim.scenario import NOMINAL
 from imudrv.site import Site
 
 DEGC = {"gyro": 35.0, "accelerometer_x": 36.0}
+PROCEDURE = """
+format: imu50-procedure
+version: 1
+name: two
+poses: [{id: z-up, up: +Z, east: +X, turn_deg: 180}, {id: x-up, up: +X, east: +Y, turn_deg: 180}]
+"""
+Accept = Callable[..., None]
 
 
 def document(path: Path) -> Document:
@@ -28,7 +35,7 @@ def begin(folder: Path) -> Session:
     papers = folder.parent
     write_calibration(papers / "unit.yaml", NOMINAL)
     config.write(papers / "site.yaml", Site(latitude_deg=28.2, longitude_deg=113.0, height_m=60.0))
-    (papers / "bench.yaml").write_text("a procedure, checked by others\n")
+    (papers / "bench.yaml").write_text(PROCEDURE)
     return Session.create(
         folder,
         procedure=document(papers / "bench.yaml"),
@@ -39,21 +46,32 @@ def begin(folder: Path) -> Session:
     )
 
 
-def accept(session: Session, step_id: str, degc: dict[str, float] = DEGC) -> None:
-    """An attempt with its files."""
-    name = f"run-{step_id}-{session.attempt(step_id)}"
-    for suffix in ("mcap", "npz"):
-        (session.folder / f"{name}.{suffix}").write_bytes(name.encode() * 100)
-        session.enter(f"{name}.{suffix}")
-    session.append(
-        {
-            "event": "accepted",
-            "step_id": step_id,
-            "counter": 1000,
-            "recording": f"{name}.mcap",
-            "temperature_degc": degc,
-        }
-    )
+@pytest.fixture
+def accept(recorded: Callable[..., Path]) -> Accept:
+    """Files an attempt with its files; the recording begins at `since`, the evidence at 1000."""
+
+    def accept(
+        session: Session, step_id: str, degc: dict[str, float] = DEGC, since: int = 900, **more: object
+    ) -> None:
+        name = f"run-{step_id}-{session.attempt(step_id)}"
+        recorded(session.folder / f"{name}.mcap", range(since, 2000))
+        (session.folder / f"{name}.npz").write_bytes(name.encode() * 100)
+        for suffix in ("mcap", "npz"):
+            session.enter(f"{name}.{suffix}")
+        session.append(
+            {
+                "event": "accepted",
+                "step_id": step_id,
+                "counter": 1000,
+                "first_counter": 1000,
+                "last_counter": 1899,
+                "recording": f"{name}.mcap",
+                "temperature_degc": degc,
+                **more,
+            }
+        )
+
+    return accept
 
 
 @pytest.fixture
@@ -64,7 +82,7 @@ def session(tmp_path: Path) -> Iterator[Session]:
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path: Path, accept: Accept) -> Path:
     """A small session that is closed."""
     session = begin(tmp_path / "session")
     accept(session, "z-up")
@@ -93,7 +111,7 @@ def test_the_first_line_holds_the_plan(folder: Path) -> None:
     plan = json.loads((folder / JOURNAL).read_text().splitlines()[0])
     certificate = folder.parent / "unit.yaml"
     assert plan["unit"] == "nominal"
-    assert plan["procedure"]["text"] == "a procedure, checked by others\n"
+    assert plan["procedure"]["text"] == PROCEDURE
     assert plan["certificate"] == {"path": str(certificate), "sha256": config.sha256(certificate)}
     assert (folder / "before.yaml").read_bytes() == certificate.read_bytes()
     assert "latitude_deg: 28.2" in plan["site"]["text"]
@@ -230,7 +248,7 @@ def test_a_journal_without_its_first_line_is_no_session(folder: Path) -> None:
 # Steps
 
 
-def test_a_step_is_accepted_until_it_is_done_again(session: Session) -> None:
+def test_a_step_is_accepted_until_it_is_done_again(session: Session, accept: Accept) -> None:
     accept(session, "z-up")
     accept(session, "x-up")
     assert list(session.accepted) == ["z-up", "x-up"]
@@ -238,6 +256,77 @@ def test_a_step_is_accepted_until_it_is_done_again(session: Session) -> None:
     assert list(session.accepted) == ["x-up"]
     accept(session, "z-up")
     assert session.accepted["z-up"]["recording"] == "run-z-up-2.mcap"
+
+
+def test_a_recording_that_does_not_cover_its_step_is_named_whether_there_is_a_certificate_or_not(
+    session: Session, accept: Accept
+) -> None:
+    accept(session, "z-up")
+    accept(session, "x-up", since=1234)
+    accept(session, "verification", since=1500, samples=900)
+    assert not verify(session.folder).notes[1:]
+    for result in (False, True):
+        if result:
+            write_calibration(session.folder / "certificate.yaml", NOMINAL)
+            session.enter("certificate.yaml")
+        x_up, verification = verify(session.folder).faults
+        again = f"do this step again: calib run --session {session.folder} --redo"
+        for fault, step, gap in (
+            (x_up, "x-up", "1000..1233"),
+            (verification, "verification", "1000..1499"),
+        ):
+            assert fault == (
+                f"{session.folder}/run-{step}-1.mcap: step {step}: its recording does not cover counters "
+                f"{gap}; {again} {step}"
+            )
+
+
+def test_a_step_that_is_withdrawn_takes_what_was_concluded_from_it_along(
+    session: Session, accept: Accept
+) -> None:
+    accept(session, "z-up")
+    accept(session, "x-up", since=1234)
+    session.append({"event": "finished", "accepted": ["z-up", "x-up"]})
+    (session.folder / "certificate.yaml").write_text("what came out\n")
+    session.enter("certificate.yaml")
+    assert session.entry("finished") is not None
+    session.redo(["x-up"])
+    assert list(session.accepted) == ["z-up"]
+    assert session.entry("finished") is None
+    assert "certificate.yaml" not in session.files
+    assert session.attempt("x-up") == 2
+    assert verify(session.folder).faults == ()
+    accept(session, "x-up", samples=900)
+    session.append({"event": "finished", "accepted": ["z-up", "x-up"]})
+    (session.folder / "certificate.yaml").write_text("what came out then\n")
+    session.enter("certificate.yaml")
+    assert session.entry("finished") is not None
+    session.require_whole()
+
+
+def test_a_step_that_there_is_not_cannot_be_done_again_and_the_steps_are_listed(
+    session: Session, accept: Accept
+) -> None:
+    accept(session, "z-up")
+    before = len(session.entries)
+    with pytest.raises(InputError, match=r"--redo: expected one of z-up, x-up, got 'y-up'"):
+        session.redo(["z-up", "y-up"])
+    assert len(session.entries) == before
+    session.redo(["x-up"])  # it was skipped
+
+
+def test_once_the_result_is_accepted_only_the_verification_is_done_again(
+    session: Session, accept: Accept
+) -> None:
+    accept(session, "z-up")
+    session.append({"event": "finished", "accepted": ["z-up"]})
+    session.append({"event": "decision", "accepted": True})
+    accept(session, "verification")
+    with pytest.raises(InputError, match=r"expected one of verification, got 'z-up'; the result is accepted"):
+        session.redo(["z-up"])
+    session.redo(["verification"])
+    assert list(session.accepted) == ["z-up"]
+    assert session.entry("decision") is not None
 
 
 def test_an_attempt_that_a_kill_has_ended_counts_and_what_it_left_is_entered(session: Session) -> None:
@@ -316,7 +405,7 @@ def test_a_certificate_that_was_changed_meanwhile_is_refused_but_the_sessions_ow
     session.require_same()
 
 
-def test_a_temperature_far_from_the_accepted_runs_is_refused(session: Session) -> None:
+def test_a_temperature_far_from_the_accepted_runs_is_refused(session: Session, accept: Accept) -> None:
     session.require_temperature({"gyro": 20.0})
     accept(session, "z-up", {"gyro": 34.0, "accelerometer_x": 36.0})
     accept(session, "x-up", {"gyro": 36.0, "accelerometer_x": 36.0})
@@ -327,7 +416,7 @@ def test_a_temperature_far_from_the_accepted_runs_is_refused(session: Session) -
         session.require_temperature({"gyro": 29.0})
 
 
-def test_a_session_with_a_damaged_recording_is_not_resumed(session: Session) -> None:
+def test_a_session_with_a_damaged_recording_is_not_resumed(session: Session, accept: Accept) -> None:
     accept(session, "z-up")
     (session.folder / "run-z-up-1.mcap").write_bytes(b"other")
     with pytest.raises(InputError, match=r"cannot be resumed:\n  .*run-z-up-1.mcap: was damaged"):
