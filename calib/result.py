@@ -23,7 +23,8 @@ from imudrv import config
 from imudrv.calibration import Calibration, coefficients
 from imudrv.errors import InputError
 from imudrv.imu.accounting import Account, Accountant
-from imudrv.imu.compensation import Coefficients, Compensator
+from imudrv.imu.coefficients import Coefficients
+from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import rate_filter
 from imudrv.recording import Recording
 from imudrv.records import Records

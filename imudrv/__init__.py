@@ -27,7 +27,8 @@ from imudrv.calibration import Calibration, coefficients, read_calibration, writ
 from imudrv.captures import Capture
 from imudrv.errors import Imu50Error, InputError
 from imudrv.imu.accounting import Account, Accountant
-from imudrv.imu.compensation import Coefficients, Compensator
+from imudrv.imu.coefficients import Coefficients
+from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import rate_filter
 from imudrv.profiles import Profile
 from imudrv.profiles import load as load_profile

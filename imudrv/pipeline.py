@@ -6,7 +6,8 @@ import numpy as np
 
 from imudrv.imu.accounting import Accountant
 from imudrv.imu.clock import ClockModel
-from imudrv.imu.compensation import Coefficients, Compensator
+from imudrv.imu.coefficients import Coefficients
+from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import RateFilter
 from imudrv.profiles import Profile
 from imudrv.records import INCREMENTS, PULSES, Flag, Records

@@ -30,7 +30,8 @@ from rich.console import Console
 from rich.table import Table
 
 from imudrv.imu.accounting import Accountant
-from imudrv.imu.compensation import Coefficients, Compensator
+from imudrv.imu.coefficients import Coefficients
+from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import rate_filter
 from imudrv.profiles import load
 from imudrv.records import PULSES, Flag, Records

@@ -36,7 +36,8 @@ from calib.validate import Setting, navigate
 from imudrv.calibration import Calibration, coefficients
 from imudrv.config import parse
 from imudrv.imu.accounting import Accountant
-from imudrv.imu.compensation import Coefficients, Compensator
+from imudrv.imu.coefficients import Coefficients
+from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import NAMES, rate_filter
 from imudrv.nav.alignment import Alignment
 from imudrv.nav.mechanisation import Navigator

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from imudrv.imu.clock import MAX_SKEW, SLEW, STALL_EDGES_S, ClockModel
-from imudrv.imu.compensation import Coefficients, Compensator
+from imudrv.imu.coefficients import Coefficients
+from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import rate_filter
 from imudrv.profiles import load
 from imudrv.records import INCREMENTS, PULSES, Flag, Records
