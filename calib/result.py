@@ -22,10 +22,10 @@ from calib.segments import BLOCK_NS
 from imudrv import config
 from imudrv.calibration import Calibration, coefficients
 from imudrv.errors import InputError
-from imudrv.imu.accounting import Account, Accountant
 from imudrv.imu.coefficients import Coefficients
 from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import rate_filter
+from imudrv.imu.sequence import SampleCounts, SequenceTracker
 from imudrv.recording import Recording
 from imudrv.records import Records
 from imudrv.site import Site
@@ -98,7 +98,7 @@ class _Heard(NamedTuple):
 
     pulses: Records  # of the evidence
     layout: Layout
-    account: Account  # of the whole recording
+    counts: SampleCounts  # of the whole recording
 
 
 def identify(procedure: Procedure, attempts: Sequence[Attempt], basis: Basis, site: Site) -> Result:
@@ -188,7 +188,7 @@ def _source(
         attempt.recording.name,
         config.sha256(attempt.recording),
         heard.layout.name,
-        str(heard.account),
+        str(heard.counts),
         tuple(
             Temperature(name, float(t.min()), float(t.max()))
             for name, column in zip(heard.layout.temperature_names, degc.T, strict=False)
@@ -226,9 +226,9 @@ def _hear(attempt: Attempt) -> _Heard:
     """Decode a recording and cut it to the evidence."""
     recording = Recording(attempt.recording)
     layout = recording.profile.layout()
-    decoder, accountant = FrameDecoder(layout), Accountant(layout)
-    pulses = [accountant.feed(decoder.feed(data)) for data in _wire(recording)]
-    pulses.append(accountant.feed(decoder.close()))
+    decoder, tracker = FrameDecoder(layout), SequenceTracker(layout)
+    pulses = [tracker.feed(decoder.feed(data)) for data in _wire(recording)]
+    pulses.append(tracker.feed(decoder.close()))
     heard = np.concatenate(pulses)
     counter = heard["counter"]
     if not len(counter):
@@ -240,7 +240,7 @@ def _hear(attempt: Attempt) -> _Heard:
     backward = np.flatnonzero(np.diff(counter) <= 0)  # the unit restarted before the evidence
     begin = int(backward[-1]) + 1 if len(backward) else 0
     first, stop = np.searchsorted(counter[begin:], [attempt.first_counter, attempt.last_counter + 1])
-    return _Heard(heard[begin + first : begin + stop], layout, accountant.account)
+    return _Heard(heard[begin + first : begin + stop], layout, tracker.counts)
 
 
 def _wire(recording: Recording) -> Iterator[bytes | Records]:

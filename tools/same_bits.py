@@ -35,10 +35,10 @@ from calib.findings import Basis, find
 from calib.validate import Setting, navigate
 from imudrv.calibration import Calibration, coefficients
 from imudrv.config import parse
-from imudrv.imu.accounting import Accountant
 from imudrv.imu.coefficients import Coefficients
 from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import NAMES, rate_filter
+from imudrv.imu.sequence import SequenceTracker
 from imudrv.nav.alignment import Alignment
 from imudrv.nav.mechanisation import Navigator
 from imudrv.pipeline import Pipeline
@@ -183,9 +183,9 @@ def offline(profile: Profile, run: Scenario) -> Results:
     disordered = frames[np.argsort(np.arange(len(frames)) + rng.exponential(0.3, len(frames)))]
     disordered["counter"][rng.integers(0, len(frames), 20)] = rng.integers(0, 2**16, 20)
     for what, arrived in ((", disordered", disordered), ("", frames)):
-        accountant = Accountant(layout)
-        pulses = np.concatenate([accountant.feed(piece) for piece in pieces(arrived, 200)])
-        yield f"account{what}", sha256(pulses, astuple(accountant.account))
+        tracker = SequenceTracker(layout)
+        pulses = np.concatenate([tracker.feed(piece) for piece in pieces(arrived, 200)])
+        yield f"account{what}", sha256(pulses, astuple(tracker.counts))
 
     for name in NAMES:
         for what, c in (("", full), (", no temperature", replace(full, temperature=None))):
@@ -253,8 +253,8 @@ def validated() -> Results:
     variants: dict[str, Any] = {"": {}, ", dither": {"rate_filter": "dither"}, ", skew": {"skew_s": 1e-3}}
     for name, motion in TESTS.items():
         run = scenario(motion, residuals={"accelerometer_bias_ug": 50, "gyro_scale_ppm": 5})
-        decoder, accountant = CaptureDecoder(layout), Accountant(layout)
-        pulses = [accountant.feed(decoder.feed(data)) for data, _ in record(run, layout)]
+        decoder, tracker = CaptureDecoder(layout), SequenceTracker(layout)
+        pulses = [tracker.feed(decoder.feed(data)) for data, _ in record(run, layout)]
         for what, options in variants.items():
             trial = navigate(name, pulses, Setting(layout, WHOLE, run.site, ALIGN_S, **options))
             yield f"validate, {name}{what}", sha256(trial.normal.v_n, trial.compensated.v_n)

@@ -16,10 +16,15 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from imudrv.imu import size_effect
 from imudrv.imu.coefficients import Coefficients
 from imudrv.imu.rate_filter import RateFilter
-from imudrv.imu.size_effect import SIZE_EFFECT, SizeEffect
+from imudrv.imu.size_effect import (
+    SIZE_EFFECT,
+    SizeEffect,
+    dv_r,
+    size_effect_constants,
+    unpack_size_effect,
+)
 from imudrv.kernels import kernel
 from imudrv.records import INCREMENTS, Flag, Records
 from imudrv.units import NS
@@ -164,7 +169,7 @@ def _constants(c: Coefficients, layout: Layout, rate_filter: RateFilter) -> Reco
     if c.r_b is not None:
         mean_of_ends_s = interval_s if rate_filter.middle_from_ends else 0.0
         k["has_size_effect"] = True
-        k["size_effect"] = size_effect.constants(c.C_ba, c.r_b, mean_of_ends_s)[0]
+        k["size_effect"] = size_effect_constants(c.C_ba, c.r_b, mean_of_ends_s)[0]
     return constants
 
 
@@ -230,7 +235,7 @@ def _scale(pulses: Records, out: Records, c: np.void) -> None:
 def _remove_size_effect(out: Records, waiting: int, c: np.void, s: np.void) -> int:
     """Finish the rows of `out` whose rates become known; return how many. The first `waiting` are not new."""
     interval_ns, lag, length, taps = c["interval_ns"], c["lag"], c["length"], c["taps"]
-    C_ba, effect = matrix(c["C_ba"]), size_effect.unpack(c["size_effect"])
+    C_ba, effect = matrix(c["C_ba"]), unpack_size_effect(c["size_effect"])
     parts, head_end, slot, history = s["parts"], s["head_end"], s["slot"], s["history"]
     rate_known, w0 = s["rate_known"], vector_at(s["rate"], 0)
     ready, i = 0, waiting
@@ -310,13 +315,12 @@ def _finish_compensated(
 ) -> None:
     """Subtract the size effect and rotate the velocity into body axes."""
     increment["flags"] |= _SIZE_EFFECT
-    dv_r = size_effect.velocity(effect, T, w0, vector_at(increment["dtheta_b"], 0), w1)
-    _finish(increment, C_ba, dv_r)
+    _finish(increment, C_ba, dv_r(effect, T, w0, vector_at(increment["dtheta_b"], 0), w1))
 
 
 @kernel
-def _finish(increment: np.void, C_ba: Matrix, dv_r: Vector) -> None:
-    put(increment["dv_b"], 0, rotate(C_ba, subtract(vector_at(increment["dv_b"], 0), dv_r)))
+def _finish(increment: np.void, C_ba: Matrix, excess: Vector) -> None:
+    put(increment["dv_b"], 0, rotate(C_ba, subtract(vector_at(increment["dv_b"], 0), excess)))
 
 
 @kernel

@@ -44,7 +44,7 @@ class SizeEffect(NamedTuple):
     mean_of_ends_s: float
 
 
-def constants(C_ba: Array, r_b: Array, mean_of_ends_s: float) -> Records:
+def size_effect_constants(C_ba: Array, r_b: Array, mean_of_ends_s: float) -> Records:
     """Compute the constants.
 
     Parameters
@@ -85,7 +85,7 @@ def _centripetal(a: Array, r: Array) -> Array:
 
 
 @kernel
-def unpack(record: np.void) -> SizeEffect:
+def unpack_size_effect(record: np.void) -> SizeEffect:
     """Read a record of `SIZE_EFFECT`."""
     q = record["centripetal"]
     return SizeEffect(
@@ -100,8 +100,8 @@ def unpack(record: np.void) -> SizeEffect:
 
 
 @kernel
-def velocity(effect: SizeEffect, T: float, w0: Vector, dtheta: Vector, w1: Vector) -> Vector:
-    """Return `dv_r`, the velocity that the size effect adds to each accelerometer.
+def dv_r(effect: SizeEffect, T: float, w0: Vector, dtheta: Vector, w1: Vector) -> Vector:
+    """Velocity that the size effect adds to each accelerometer.
 
     Parameters
     ----------

@@ -207,7 +207,7 @@ def test_a_host_clock_that_steps_forward_is_followed_after_ten_seconds() -> None
 
 def test_a_restart_of_the_unit_begins_the_line_anew() -> None:
     before, after = samples(20_000, first=500_000), samples(20_000)
-    after["elapsed_ns"] += before["elapsed_ns"][-1]  # as the accountant counts on
+    after["elapsed_ns"] += before["elapsed_ns"][-1]  # as the tracker counts on
     before["arrival_ns"] = BEGIN + TAU * np.arange(20_000)
     after["arrival_ns"] = before["arrival_ns"][-1] + 3 * S + TAU * np.arange(20_000)
     stamps, locked = ClockModel(TAU).feed(np.concatenate([before, after]))
