@@ -184,7 +184,7 @@ def _temperature_channels(layout: Layout) -> NDArray[np.int64]:
     return np.array([channel("gyro"), *accelerometers], np.int64)
 
 
-class AtTemperature(NamedTuple):
+class _AtTemperature(NamedTuple):
     """Scale and bias of all axes at a temperature."""
 
     gyro_scale: Vector  # rad per pulse
@@ -360,7 +360,7 @@ def _differ(degc: Array, before: Array, channels: NDArray[np.int64]) -> bool:
 
 
 @kernel
-def _at_temperature(degc: Array, c: np.void) -> AtTemperature:
+def _at_temperature(degc: Array, c: np.void) -> _AtTemperature:
     """Scale and bias at a sample's temperatures."""
     low, high, channels = c["low_degc"], c["high_degc"], c["channels"]
     gyro, accelerometer, in_range = 0.0, _ZERO, True  # kelvins from the reference
@@ -375,7 +375,7 @@ def _at_temperature(degc: Array, c: np.void) -> AtTemperature:
         for k in range(len(channels)):
             in_range = in_range and channels[k] >= 0 and low <= degc[channels[k]] <= high
     K = _scale_at(c["accelerometer_scale"], c["accelerometer_scale_per_k"], accelerometer)
-    return AtTemperature(
+    return _AtTemperature(
         _scale_at(c["gyro_scale"], c["gyro_scale_per_k"], (gyro, gyro, gyro)),
         add(vector_at(c["gyro_bias"], 0), scale(gyro, vector_at(c["gyro_bias_per_k"], 0))),
         (1.0 / K[0], 1.0 / K[1], 1.0 / K[2]),
