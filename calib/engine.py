@@ -59,10 +59,10 @@ from imudrv.nav.alignment import SHORTEST_S, Aligned, Alignment
 from imudrv.nav.attitude import Quaternion, conjugate, turn
 from imudrv.nav.earth import EARTH_RATE, normal_gravity
 from imudrv.nav.mechanisation import Navigator
-from imudrv.nav.vectors import Vector
 from imudrv.records import Flag, Records
 from imudrv.site import Site
 from imudrv.units import DEG, DEG_PER_H, NS
+from imudrv.vectors import Vector
 
 __all__ = [
     "PREFLIGHT",

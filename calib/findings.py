@@ -271,7 +271,7 @@ def _read(
         path.name,
         sha256(path),
         capture.layout.name,
-        str(capture.accountant.account),
+        str(capture.tracker.counts),
         tuple(
             Temperature(name, float(least), float(most))
             for name, least, most in zip(names, low, high, strict=False)

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from calib.segments import BLOCK_NS, axis_name
 from imudrv.nav.attitude import Quaternion, conjugate, product, quaternion_of_vector, turn, unit
 from imudrv.nav.earth import earth_rate_n
-from imudrv.nav.vectors import Vector, add, dot, scale, subtract
 from imudrv.records import Records
 from imudrv.units import DEG, NS, STANDARD_GRAVITY
+from imudrv.vectors import Vector, add, dot, scale, subtract
 
 Array = NDArray[np.float64]
 

@@ -23,9 +23,10 @@ from calib.segments import BLOCK_NS
 from imudrv import config
 from imudrv.calibration import Calibration, coefficients
 from imudrv.errors import InputError
-from imudrv.imu.accounting import Account, Accountant
-from imudrv.imu.compensation import Coefficients, Compensator
+from imudrv.imu.coefficients import Coefficients
+from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import rate_filter
+from imudrv.imu.sequence import SampleCounts, SequenceTracker
 from imudrv.recording import Recording
 from imudrv.records import Records
 from imudrv.site import Site
@@ -104,7 +105,7 @@ class _Heard(NamedTuple):
     pulses: Records  # of the evidence
     counter: NDArray[np.int64]  # of the pulses, as the service counted them
     layout: Layout
-    account: Account  # of the whole recording
+    counts: SampleCounts  # of the whole recording
 
 
 def identify(procedure: Procedure, attempts: Sequence[Attempt], basis: Basis, site: Site) -> Result:
@@ -231,7 +232,7 @@ def _source(
         attempt.recording.name,
         config.sha256(attempt.recording),
         heard.layout.name,
-        str(heard.account),
+        str(heard.counts),
         tuple(
             Temperature(name, float(t.min()), float(t.max()))
             for name, column in zip(heard.layout.temperature_names, degc.T, strict=False)
@@ -281,9 +282,9 @@ def _decoded(attempt: Attempt) -> _Heard:
     """Decode a recording and cut it to what there is of the evidence."""
     recording = Recording(attempt.recording)
     layout = recording.profile.layout()
-    decoder, accountant = FrameDecoder(layout), Accountant(layout)
-    pulses = [accountant.feed(decoder.feed(data)) for data in _wire(recording)]
-    pulses.append(accountant.feed(decoder.close()))
+    decoder, tracker = FrameDecoder(layout), SequenceTracker(layout)
+    pulses = [tracker.feed(decoder.feed(data)) for data in _wire(recording)]
+    pulses.append(tracker.feed(decoder.close()))
     heard = np.concatenate(pulses)
     counter = heard["counter"]
     backward = np.flatnonzero(np.diff(counter) <= 0)  # the unit restarted before the evidence
@@ -292,7 +293,7 @@ def _decoded(attempt: Attempt) -> _Heard:
     if len(counter) and not begin:  # at a restart the service, too, begins with the unit's own number
         counter = counter + _offset(recording, attempt, int(counter[0]), 1 << layout.counter_bits)
     first, stop = np.searchsorted(counter, [attempt.first_counter, attempt.last_counter + 1])
-    return _Heard(heard[begin + first : begin + stop], counter[first:stop], layout, accountant.account)
+    return _Heard(heard[begin + first : begin + stop], counter[first:stop], layout, tracker.counts)
 
 
 def _offset(recording: Recording, attempt: Attempt, first: int, period: int) -> int:

@@ -36,7 +36,8 @@ from calib.runs import GUARD_S, Priors
 from calib.segments import BLOCK_NS, Noise, Segments, find_segments, pooled_noise
 from imudrv.calibration import Calibration, coefficients
 from imudrv.errors import InputError
-from imudrv.imu.compensation import Coefficients, Compensator
+from imudrv.imu.coefficients import Coefficients
+from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import RateFilterName, rate_filter
 from imudrv.nav.alignment import DURATION_S, Aligned, Alignment
 from imudrv.nav.earth import SEMI_MAJOR_AXIS, normal_gravity

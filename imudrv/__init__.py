@@ -7,7 +7,8 @@ The flow, one way; every stage is a package or module that can be read alone::
 
     ports  where bytes and CAN messages come from, by URL: `open_port`
     wire   decodes: `StreamDecoder`, `CandumpDecoder` + `CanAssembler`; encodes for the simulator
-    imu    accounts for every sample (`Accountant`), stamps it (`ClockModel`), compensates it (`Compensator`)
+    imu    accounts for every sample (`SequenceTracker`), stamps it (`ClockModel`),
+           compensates it (`Compensator`)
     sinks  where increments go, by URL, and the recorder
     pipeline, service    the stages in a row, and the one thread that runs them live
     captures, recording  the same from files
@@ -26,9 +27,10 @@ Increments come first: `dtheta_b` (rad) and `dv_b` (m/s) cover `interval_ns`, ne
 from imudrv.calibration import Calibration, coefficients, read_calibration, write_calibration
 from imudrv.captures import Capture
 from imudrv.errors import Imu50Error, InputError
-from imudrv.imu.accounting import Account, Accountant
-from imudrv.imu.compensation import Coefficients, Compensator
+from imudrv.imu.coefficients import Coefficients
+from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import rate_filter
+from imudrv.imu.sequence import SampleCounts, SequenceTracker
 from imudrv.profiles import Profile
 from imudrv.profiles import load as load_profile
 from imudrv.receive import Receiver, receive
@@ -43,8 +45,6 @@ __all__ = [
     "FRAME",
     "INCREMENTS",
     "PULSES",
-    "Account",
-    "Accountant",
     "Calibration",
     "Capture",
     "CaptureDecoder",
@@ -58,6 +58,8 @@ __all__ = [
     "Reason",
     "Receiver",
     "Recording",
+    "SampleCounts",
+    "SequenceTracker",
     "Site",
     "Source",
     "StreamDecoder",

@@ -14,7 +14,7 @@ from pydantic import Field as Key
 
 from imudrv.config import Matrix3, Model, UtcTime, read, write
 from imudrv.errors import InputError
-from imudrv.imu.compensation import Coefficients, TemperatureTerms
+from imudrv.imu.coefficients import Coefficients, TemperatureTerms
 from imudrv.units import ARCSEC, DEG_PER_H, MM, PPM, UG
 
 Array: TypeAlias = NDArray[np.float64]

@@ -8,9 +8,9 @@ import numpy as np
 
 from imudrv import profiles
 from imudrv.errors import InputError
-from imudrv.imu.accounting import Accountant
 from imudrv.imu.clock import ClockModel
 from imudrv.imu.compensation import Compensator
+from imudrv.imu.sequence import SequenceTracker
 from imudrv.profiles import Profile
 from imudrv.recording import Recording
 from imudrv.records import Flag, Reason, Records
@@ -23,7 +23,7 @@ READS_AT_ONCE = 1000
 
 
 class Capture:
-    """A capture file and the books on it.
+    """A capture file and the counts of its samples.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ class Capture:
             raise InputError(f"{path}: expected --profile, for only a recording knows what the unit sends")
         self.profile = profile
         self.layout = profile.layout()
-        self.accountant = Accountant(self.layout)
+        self.tracker = SequenceTracker(self.layout)
         self._decoder = CaptureDecoder(self.layout) if self.recording is None else FrameDecoder(self.layout)
 
     @property
@@ -82,9 +82,9 @@ class Capture:
             The whole file held no frame of the profile; says which shipped profile fits, if one does.
         """
         for frames in self._frames(advance):
-            yield self.accountant.feed(frames)
-        yield self.accountant.feed(self._decoder.close())
-        if self.accountant.account.frames == 0:
+            yield self.tracker.feed(frames)
+        yield self.tracker.feed(self._decoder.close())
+        if self.tracker.counts.frames == 0:
             raise InputError(
                 f"{self.path}: expected frames of {self.layout.name}, "
                 f"got none in {self.size} bytes{self._hint()}"

@@ -281,9 +281,9 @@ def _check(arguments: argparse.Namespace) -> None:
 
 
 def _report(capture: Capture, output: Path) -> None:
-    """The books of a capture, for people."""
+    """Print the loss summary of a capture."""
     print(f"{capture.path}: {capture.layout.name}, {capture.size} bytes -> {output}")
-    print(f"  {capture.accountant.account}")
+    print(f"  {capture.tracker.counts}")
     for reason, rejected in sorted(capture.rejected.items()):
         name = reason.name.lower().replace("_", " ")
         first = ", ".join(map(str, rejected.first))

@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from imudrv.imu.accounting import Account, Accountant
+from imudrv.imu.sequence import SampleCounts, SequenceTracker
 from imudrv.profiles import Profile, SerialLine
 from imudrv.records import Reason, Records
 from imudrv.units import NS, NS_PER_S
@@ -40,7 +40,7 @@ class Heard:
         Bytes or messages, of all.
     syncs : int
         How often the bytes came that a frame begins with; on CAN messages with the profile's identifiers.
-    account : Account
+    counts : SampleCounts
         Where the samples went.
     rejected : dict of Reason to int
         Stretches that are no frame.
@@ -54,7 +54,7 @@ class Heard:
 
     amount: int
     syncs: int
-    account: Account
+    counts: SampleCounts
     rejected: dict[Reason, int]
     messages: dict[int, int]
     set_bits: tuple[str, ...]
@@ -63,13 +63,13 @@ class Heard:
     @property
     def fits(self) -> bool:
         """The profile is that of the data."""
-        return self.account.frames >= FEW
+        return self.counts.frames >= FEW
 
     @property
     def is_clean(self) -> bool:
         """Less than one sample in a hundred was lost or came twice."""
-        spoilt = self.account.lost + self.account.duplicate
-        return spoilt * 100 < self.account.expected
+        spoilt = self.counts.lost + self.counts.duplicate
+        return spoilt * 100 < self.counts.expected
 
 
 def hear(profile: Profile, data: bytes | Records) -> Heard:
@@ -96,8 +96,8 @@ def hear(profile: Profile, data: bytes | Records) -> Heard:
     rejected = {reason: entry.stretches for reason, entry in decoder.rejected.items()}
     if layout.can:
         frames = np.concatenate([frames, decoder.close()])  # held until their full counter comes
-    accountant = Accountant(layout)
-    pulses = accountant.feed(frames)
+    tracker = SequenceTracker(layout)
+    pulses = tracker.feed(frames)
     status = int(np.bitwise_or.reduce(pulses["status"])) if pulses.size else 0
     degc = pulses["temperature_degc"][-1].tolist() if pulses.size else []
     if isinstance(data, bytes):
@@ -109,7 +109,7 @@ def hear(profile: Profile, data: bytes | Records) -> Heard:
     return Heard(
         len(data),
         syncs,
-        accountant.account,
+        tracker.counts,
         rejected,
         messages,
         tuple(name for bit, name in layout.status_names if status >> bit & 1),
@@ -136,7 +136,7 @@ def best(candidates: Iterable[Profile], data: bytes | Records) -> Profile | None
     found: tuple[int, Profile] | None = None
     for profile in candidates:
         if profile.transport == transport and (heard := hear(profile, data)).fits:
-            read = heard.account.frames * sum(m.length for m in profile.messages if m.every == 1)
+            read = heard.counts.frames * sum(m.length for m in profile.messages if m.every == 1)
             if found is None or read > found[0]:
                 found = read, profile
     return found[1] if found else None
@@ -220,7 +220,7 @@ class LineWatch:
         Parameters
         ----------
         expected : int
-            Samples by the unit's counter, see `imudrv.imu.accounting.Account`.
+            Samples by the unit's counter, see `imudrv.imu.sequence.SampleCounts`.
         t_ns : int
             Time now.
         """
@@ -320,9 +320,9 @@ def explain(profile: Profile, heard: Heard, seconds: float) -> str:
     str
     """
     what = "bytes" if profile.transport == "serial" else "messages"
-    words = [f"{heard.amount / seconds:.0f} {what}/s, {heard.account.frames} good frames"]
-    if heard.account.frames:
-        words.append(f"{rate(heard, seconds):.0f} samples/s by the counter, {heard.account.lost} lost")
+    words = [f"{heard.amount / seconds:.0f} {what}/s, {heard.counts.frames} good frames"]
+    if heard.counts.frames:
+        words.append(f"{rate(heard, seconds):.0f} samples/s by the counter, {heard.counts.lost} lost")
     for reason, count in sorted(heard.rejected.items()):
         words.append(f"{count} x {reason.name.lower().replace('_', ' ')}")
     if heard.messages:
@@ -332,4 +332,4 @@ def explain(profile: Profile, heard: Heard, seconds: float) -> str:
 
 def rate(heard: Heard, seconds: float) -> float:
     """Samples a second that the unit counted."""
-    return heard.account.expected / seconds
+    return heard.counts.expected / seconds

@@ -437,7 +437,7 @@ def judge(profile: Profile, heard: diagnosis.Heard, span_s: float, in_real_time:
     ------
     Step
     """
-    account = heard.account
+    counts = heard.counts
     found = diagnosis.explain(profile, heard, span_s)
     if heard.is_clean:
         yield Step("data", Verdict.OK, found)
@@ -445,12 +445,12 @@ def judge(profile: Profile, heard: diagnosis.Heard, span_s: float, in_real_time:
         yield Step(
             "data",
             Verdict.FAIL,
-            f"{found}; {account}",
+            f"{found}; {counts}",
             "look at cable, ground, termination and line settings; is the reader quick enough?",
         )
-    if account.restarts:
+    if counts.restarts:
         yield Step(
-            "counter", Verdict.WARN, f"it jumped back {account.restarts} times", "does the unit's power hold?"
+            "counter", Verdict.WARN, f"it jumped back {counts.restarts} times", "does the unit's power hold?"
         )
     rate = diagnosis.rate(heard, span_s)
     if in_real_time and abs(rate / profile.sample_rate_hz - 1.0) > diagnosis.RATE_TOLERANCE:

@@ -16,7 +16,7 @@ from imudrv.status import Status, ask
 
 PERIOD_S: Final = 0.5
 _COLOURS: Final = {"ok": "green", "warn": "yellow", "fail": "red"}
-_LOSSES: Final = ("damaged", "torn", "missing", "late", "duplicate", "stray", "restarts")
+_LOSSES: Final = ("damaged", "torn", "missing", "out_of_order", "duplicate", "invalid_counter", "restarts")
 
 
 def monitor(path: Path, console: Console) -> None:
@@ -59,7 +59,7 @@ def view(status: Status) -> RenderableType:
     -------
     renderable
     """
-    port, account, clock, latency = (status[name] for name in ("port", "account", "clock", "latency"))
+    port, samples, clock, latency = (status[name] for name in ("port", "samples", "clock", "latency"))
     health = Text(f" {status['health'].upper()} ", f"bold white on {_COLOURS[status['health']]}")
     health.append("  " + "; ".join(status["reasons"] or ["all well"]), "default on default")
     table = Table.grid(padding=(0, 2), expand=True)
@@ -71,8 +71,8 @@ def view(status: Status) -> RenderableType:
 
     add("unit", f"{status['unit']}, {status['profile']}, calibration {status['calibration']['sha256'][:12]}")
     add("port", f"{port['url']}: {port['state']}, {port['reconnects']} reconnects")
-    add("rate", f"{status['rate_hz']:.1f} of {status['nominal_rate_hz']:g} samples/s, {account['good']} good")
-    losses = [f"{account[name]} {name}" for name in _LOSSES if account[name]]
+    add("rate", f"{status['rate_hz']:.1f} of {status['nominal_rate_hz']:g} samples/s, {samples['good']} good")
+    losses = [f"{samples[name]} {name.replace('_', ' ')}" for name in _LOSSES if samples[name]]
     add("losses", ", ".join(losses) or "none", "yellow" if losses else "")
     if rejected := [f"{r['stretches']} {name.replace('_', ' ')}" for name, r in status["rejected"].items()]:
         add("no frames", ", ".join(rejected), "yellow")

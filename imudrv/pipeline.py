@@ -4,10 +4,11 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from imudrv.imu.accounting import Accountant
 from imudrv.imu.clock import ClockModel
-from imudrv.imu.compensation import Coefficients, Compensator
+from imudrv.imu.coefficients import Coefficients
+from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import RateFilter
+from imudrv.imu.sequence import SequenceTracker
 from imudrv.profiles import Profile
 from imudrv.records import INCREMENTS, PULSES, Flag, Records
 from imudrv.wire.decoder import FrameDecoder
@@ -48,7 +49,7 @@ class Pipeline:
         self._layout = profile.layout()
         self._rate_filter = rate_filter
         self.decoder = FrameDecoder(self._layout)
-        self.accountant = Accountant(self._layout)
+        self.tracker = SequenceTracker(self._layout)
         self.clock = ClockModel(self._layout.interval_ns, profile.transmission_ns)
         self._compensator = Compensator(coefficients, self._layout, rate_filter)
         self._next: Compensator | None = None
@@ -101,7 +102,7 @@ class Pipeline:
     def _through(self, frames: Records) -> Sampled:
         if not len(frames):
             return _NOTHING
-        pulses = self.accountant.feed(frames)
+        pulses = self.tracker.feed(frames)
         if not len(pulses):
             return Sampled(pulses, _NOTHING.increments)
         self.clock.feed(pulses)

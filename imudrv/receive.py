@@ -3,7 +3,7 @@
 with imudrv.receive("udp://:5005") as receiver:
     for increments in receiver:
         position += ...
-print(receiver.account)
+print(receiver.counts)
 """
 
 import os
@@ -19,7 +19,7 @@ import numpy as np
 import serial
 
 from imudrv.errors import InputError
-from imudrv.imu.accounting import Account, Accountant
+from imudrv.imu.sequence import SampleCounts, SequenceTracker
 from imudrv.ports.base import PortLostError
 from imudrv.ports.serial import explain
 from imudrv.ports.url import Url, split
@@ -70,7 +70,7 @@ class Receiver:
         self.rejected_bytes = 0
         self._timeout_s = timeout_s
         self._decoder = DatagramDecoder()
-        self._accountant = Accountant(_COUNTED)
+        self._tracker = SequenceTracker(_COUNTED)
         self._ordered(b"")  # whatever has to be compiled is compiled before samples wait
         self._device = _open(split(url))
         self._is_packets = isinstance(self._device, socket.socket) and (
@@ -84,14 +84,14 @@ class Receiver:
         self._is_open = True
 
     @property
-    def account(self) -> Account:
-        """Where every sample went, by the counter."""
-        return self._accountant.account
+    def counts(self) -> SampleCounts:
+        """Samples by what became of them."""
+        return self._tracker.counts
 
     @property
     def lost(self) -> int:
-        """Samples that the counter says there were and that were not handed on."""
-        return self.account.lost
+        """Samples that were sent, by their counter, and not output."""
+        return self.counts.lost
 
     def __iter__(self) -> Self:
         return self
@@ -136,7 +136,7 @@ class Receiver:
         frames = np.zeros(len(received.increments), FRAME)
         frames["counter"] = received.increments["counter"]
         frames["t_ns"] = np.arange(len(frames))  # comes back as the arrival: which ones were good
-        in_order: Records = received.increments[self._accountant.feed(frames)["arrival_ns"]]
+        in_order: Records = received.increments[self._tracker.feed(frames)["arrival_ns"]]
         return in_order
 
 

@@ -292,12 +292,12 @@ class Service:
         self._is_news = False
         seconds = (now - self._told_ns) * NS
         if seconds >= 1.0:
-            account = self._pipeline.accountant.account
+            counts = self._pipeline.tracker.counts
             self._rate_hz = (self._samples - self._samples_told) / seconds
-            self._lost_last_s = account.lost - self._lost_told
-            self._samples_told, self._lost_told, self._told_ns = self._samples, account.lost, now
+            self._lost_last_s = counts.lost - self._lost_told
+            self._samples_told, self._lost_told, self._told_ns = self._samples, counts.lost, now
             if self._port is not None:
-                self._watch.counted(account.expected, now)
+                self._watch.counted(counts.expected, now)
         status = self.status(now)
         self._line = json.dumps(status).encode() + b"\n"
         if self._recorder is not None:
@@ -385,7 +385,7 @@ class Service:
         self._publish(self._pipeline.close(), now_ns())
         if self._port is not None:
             self._port.close()
-        self._event(f"end: {self._pipeline.accountant.account}")
+        self._event(f"end: {self._pipeline.tracker.counts}")
         self._refresh(now_ns())
         if self._recorder is not None:
             self._recorder.close()
@@ -409,7 +409,7 @@ class Service:
         dict
             Text, numbers, lists and mappings; `health` and `reasons` judge the rest.
         """
-        account = self._pipeline.accountant.account
+        counts = self._pipeline.tracker.counts
         pulses, increments = self._last_pulses[-1], self._last_increments[-1]
         clock, latency = self._pipeline.clock.report, self._latency.report
         bits = [name for bit, name in self._layout.status_names if int(pulses["status"]) >> bit & 1]
@@ -439,11 +439,11 @@ class Service:
             },
             "rate_hz": self._rate_hz,
             "nominal_rate_hz": self._profile.sample_rate_hz,
-            "account": {
-                **vars(account),
-                "lost": account.lost,
+            "samples": {
+                **vars(counts),
+                "lost": counts.lost,
                 "lost_last_s": self._lost_last_s,
-                "closes": account.closes,
+                "closes": counts.closes,
             },
             "rejected": {
                 reason.name.lower(): {"stretches": r.stretches, "length": r.length}

@@ -146,15 +146,15 @@ def health(status: Status) -> tuple[str, list[str]]:
         failures.append(f"port {port['state']}: {port['trouble'] or port['url']}")
     elif port["trouble"]:
         warnings.append(port["trouble"])
-    if not status["account"]["closes"]:
-        failures.append("the account of samples does not close: a defect of this product, please report it")
+    if not status["samples"]["closes"]:
+        failures.append("the sample counts do not add up: a defect of this product, please report it")
     warnings += [f"unit: {name}" for name in status["unit_status"]["faults"]]
     warnings += [f"{s['url']}: {s['state']}" for s in status["sinks"] if not s["healthy"]]
     recording = status["recording"]
     if recording and not recording["healthy"]:
         failures.append(f"recording {recording['url']}: {recording['state']}")
-    if status["account"]["lost_last_s"]:
-        warnings.append(f"{status['account']['lost_last_s']} samples lost in the last second")
+    if status["samples"]["lost_last_s"]:
+        warnings.append(f"{status['samples']['lost_last_s']} samples lost in the last second")
     if port["state"] == "streaming" and not status["clock"]["locked"]:
         warnings.append("clock not locked yet")
     warnings += status["notices"]

@@ -8,9 +8,9 @@ import pytest
 from imudrv import profiles
 from imudrv.calibration import Calibration, coefficients
 from imudrv.config import parse
-from imudrv.imu.accounting import Accountant
 from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import rate_filter
+from imudrv.imu.sequence import SequenceTracker
 from imudrv.records import Flag, Records
 from imudrv.sim.capture import record
 from imudrv.sim.scenario import Scenario
@@ -78,16 +78,16 @@ def driven(
 ) -> tuple[Records, Records]:
     """Compensated increments and the truth of the same samples."""
     layout = profiles.load(profile).layout()
-    decoder, accountant = CaptureDecoder(layout), Accountant(layout)
+    decoder, tracker = CaptureDecoder(layout), SequenceTracker(layout)
     rates = rate_filter(filter_name, layout.interval_ns)  # type: ignore[arg-type]
     compensator = Compensator(coefficients(calibration), layout, rates)
     got, truth = [], []
     for data, true in record(run, layout):
-        got.append(compensator.feed(accountant.feed(decoder.feed(data))))
+        got.append(compensator.feed(tracker.feed(decoder.feed(data))))
         truth.append(true)
-    got += [compensator.feed(accountant.feed(decoder.close())), compensator.close()]
-    assert accountant.account.closes
-    assert accountant.account.lost == 0
+    got += [compensator.feed(tracker.feed(decoder.close())), compensator.close()]
+    assert tracker.counts.closes
+    assert tracker.counts.lost == 0
     increments, true = np.concatenate(got), np.concatenate(truth)
     first = len(true) - len(increments)  # running totals give no sample for their first frame
     np.testing.assert_array_equal((increments["counter"] - true["counter"][first:]) % 2**16, 0)

@@ -350,7 +350,7 @@ def test_a_profile_reads_a_stretch_that_begins_and_ends_anywhere() -> None:
     heard = diagnosis.hear(RS422, data[17:-3])
     assert heard.fits
     assert heard.is_clean
-    assert heard.account.good == 498
+    assert heard.counts.good == 498
     assert heard.rejected == {}
 
 

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from imudrv.imu.compensation import Coefficients
+from imudrv.imu.coefficients import Coefficients
 from imudrv.imu.rate_filter import RateFilterName, rate_filter
 from imudrv.pipeline import Pipeline
 from imudrv.profiles import load

@@ -8,7 +8,7 @@ import pytest
 
 from imudrv import profiles
 from imudrv.errors import FaultyFileError, InputError
-from imudrv.imu.accounting import Accountant
+from imudrv.imu.sequence import SequenceTracker
 from imudrv.records import PULSES, Flag, Records
 from imudrv.wire.encode import StreamEncoder
 from imudrv.wire.layout import Layout
@@ -132,10 +132,10 @@ def test_an_invented_profile_works_by_path_without_code(document: dict[str, obje
     span = 1 << layout.counter_bits
     sent = some_pulses(layout, 3000, first=span - 1000)  # across the counter's wrap
     wire = StreamEncoder(layout).encode(sent).tobytes()
-    decoder, accountant = StreamDecoder(layout), Accountant(layout)
+    decoder, tracker = StreamDecoder(layout), SequenceTracker(layout)
     noise = b"\xaa\x55\x00\x0d"
     found = [
-        accountant.feed(decoder.feed(piece).frames) for piece in (noise + wire[:1111], wire[1111:], b"tail")
+        tracker.feed(decoder.feed(piece).frames) for piece in (noise + wire[:1111], wire[1111:], b"tail")
     ]
     got = np.concatenate(found)
     lost = 1 if layout.totals else 0  # the first total only gives the starting point
@@ -146,7 +146,7 @@ def test_an_invented_profile_works_by_path_without_code(document: dict[str, obje
     assert np.isnan(got["temperature_degc"][:, 1:]).all()
     assert set(got["interval_ns"]) == {layout.interval_ns}
     assert set(got["flags"]) == {int(Flag.VALID)}
-    assert accountant.account.closes
+    assert tracker.counts.closes
 
 
 def test_a_profile_tells_all_its_faults_at_once(tmp_path: Path) -> None:

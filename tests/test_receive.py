@@ -82,7 +82,7 @@ def test_what_is_missing_is_counted_across_the_wrap_of_the_counter(udp: Udp) -> 
     udp.send(datagrams(kept))
     np.testing.assert_array_equal(take(udp.receiver, 6), kept)
     assert udp.receiver.lost == 4
-    assert udp.receiver.account.closes
+    assert udp.receiver.counts.closes
 
 
 def test_duplicate_and_late_samples_are_left_out_and_counted(udp: Udp) -> None:
@@ -90,8 +90,8 @@ def test_duplicate_and_late_samples_are_left_out_and_counted(udp: Udp) -> None:
     for k in (0, 1, 1, 4, 3, 5, 0, 6, 7):
         udp.send(datagrams(sent[k : k + 1]))
     assert take(udp.receiver, 6)["counter"].tolist() == [0, 1, 4, 5, 6, 7]
-    account = udp.receiver.account
-    assert (account.duplicate, account.late, account.missing, udp.receiver.lost) == (2, 1, 1, 2)
+    counts = udp.receiver.counts
+    assert (counts.duplicate, counts.out_of_order, counts.missing, udp.receiver.lost) == (2, 1, 1, 2)
 
 
 def test_a_driver_that_begins_anew_loses_nothing(udp: Udp) -> None:
@@ -99,7 +99,7 @@ def test_a_driver_that_begins_anew_loses_nothing(udp: Udp) -> None:
     udp.send(datagrams(increments(3)))
     assert take(udp.receiver, 6)["counter"].tolist() == [5_000, 5_001, 5_002, 0, 1, 2]
     assert udp.receiver.lost == 0
-    assert udp.receiver.account.restarts == 1
+    assert udp.receiver.counts.restarts == 1
 
 
 def test_packets_that_are_no_datagrams_cost_nothing(udp: Udp) -> None:

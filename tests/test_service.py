@@ -125,7 +125,7 @@ class Service:
         return ask(self.socket)
 
     def good(self) -> int:
-        return int(self.status()["account"]["good"])
+        return int(self.status()["samples"]["good"])
 
     def heard(self, words: str) -> bool:
         return any(words in line for line in [*self.said, *self.warned])
@@ -248,8 +248,8 @@ def test_an_unplug_is_told_and_after_the_replug_the_stream_goes_on_with_the_gap_
         unit.send(300)
         until(lambda: service.good() == 600, "the other 300 samples")
         status = service.status()
-        assert status["account"]["missing"] == 50
-        assert status["account"]["closes"]
+        assert status["samples"]["missing"] == 50
+        assert status["samples"]["closes"]
         until(lambda: service.status()["port"]["reconnects"] == 1, "the reconnect counted")
         assert service.stop() == 0
     increments = np.concatenate(list(Recording(folder / "run.mcap").increments()))
@@ -417,7 +417,7 @@ def test_a_status_for_scripts_and_one_for_people(folder: Path) -> None:
 
         as_json = service.command("status", "--json")
         assert as_json.returncode == 4
-        assert json.loads(as_json.stdout)["account"]["good"] == 100
+        assert json.loads(as_json.stdout)["samples"]["good"] == 100
         assert service.command("status").stdout.startswith("fail\nport silent")
         assert "100 good" in service.command("monitor").stdout
         second = subprocess.run(

@@ -29,9 +29,10 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from imudrv.imu.accounting import Accountant
-from imudrv.imu.compensation import Coefficients, Compensator
+from imudrv.imu.coefficients import Coefficients
+from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import rate_filter
+from imudrv.imu.sequence import SequenceTracker
 from imudrv.profiles import load
 from imudrv.records import PULSES, Flag, Records
 from imudrv.sim.faults import StreamFaults
@@ -127,7 +128,7 @@ def plain_decode(data: bytes) -> list[tuple[int, ...]]:
 
 
 def plain_account(frames: Records) -> tuple[Records, int]:
-    """Pulses and number of lost samples; blind to late, doubled and stray frames and to restarts."""
+    """Pulses and number of lost samples; blind to disorder, duplicates, invalid counters and restarts."""
     steps = np.diff(frames["counter"], prepend=frames["counter"][0] - 1) % 2**32
     status = LAYOUT.status
     fault = frames["status"] & status.fault != 0
@@ -190,16 +191,16 @@ def throughput(rounds: int) -> list[Measure]:
     causal = rate_filter("causal", LAYOUT.interval_ns)
 
     # Each stage once: warms its kernels and gives the next one its input.
-    decoder, accountant = StreamDecoder(LAYOUT), Accountant(LAYOUT)
+    decoder, tracker = StreamDecoder(LAYOUT), SequenceTracker(LAYOUT)
     frames = [decoder.feed(piece).frames for piece in pieces]
-    pulses = [accountant.feed(piece) for piece in frames]
+    pulses = [tracker.feed(piece) for piece in frames]
     increments = Compensator(CALIBRATION, LAYOUT, causal).feed(pulses[0])
     count = sum(map(len, frames))
 
     by_loop = plain_decode(some)
     assert [row[0] for row in by_loop] == np.concatenate(frames)["counter"][: len(by_loop)].tolist()
     by_arrays, lost = plain_account(np.concatenate(frames))
-    assert lost == accountant.account.lost
+    assert lost == tracker.counts.lost
     for name in PULSES.names or ():
         assert np.array_equal(
             by_arrays[name], np.concatenate(pulses)[name], equal_nan=name == "temperature_degc"
@@ -210,14 +211,14 @@ def throughput(rounds: int) -> list[Measure]:
 
     def flow() -> tuple[float, float, float]:
         """Go over the capture once, piece by piece through all stages; seconds of each."""
-        decoder, accountant = StreamDecoder(LAYOUT), Accountant(LAYOUT)
+        decoder, tracker = StreamDecoder(LAYOUT), SequenceTracker(LAYOUT)
         compensator = Compensator(CALIBRATION, LAYOUT, causal)
         decoding = accounting = compensating = 0.0
         for piece in pieces:
             begin = time.perf_counter()
             found = decoder.feed(piece).frames
             decoded = time.perf_counter()
-            good = accountant.feed(found)
+            good = tracker.feed(found)
             accounted = time.perf_counter()
             compensator.feed(good)
             compensating += time.perf_counter() - accounted

@@ -38,9 +38,9 @@ from imudrv import config, profiles
 from imudrv.calibration import Calibration, coefficients
 from imudrv.console import INTERRUPTED, OK, OUR_FAULT
 from imudrv.errors import InputError
-from imudrv.imu.accounting import Accountant
 from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import NAMES, rate_filter
+from imudrv.imu.sequence import SequenceTracker
 from imudrv.profiles import Profile
 from imudrv.records import INCREMENTS, MESSAGE, PULSES, Records
 from imudrv.settings import Settings
@@ -470,13 +470,13 @@ def use(settings: config.Model) -> None:
         scenario.samples(settings, 1_000_000)
     elif isinstance(settings, Calibration):
         layout = SHIPPED[SERIAL[0]]
-        pulses = Accountant(layout).feed(StreamDecoder(layout).feed(wire(rng, layout, 9)).frames)
+        pulses = SequenceTracker(layout).feed(StreamDecoder(layout).feed(wire(rng, layout, 9)).frames)
         require_finite(Compensator(coefficients(settings), layout, FILTERS["causal"]).feed(pulses))
     elif isinstance(settings, Profile):
         layout = settings.layout()
-        decoder, accountant = (CanAssembler if layout.can else StreamDecoder)(layout), Accountant(layout)
-        pulses = accountant.feed(decoder.feed(wire(rng, layout, 9)).frames)
-        assert accountant.account.closes
+        decoder, tracker = (CanAssembler if layout.can else StreamDecoder)(layout), SequenceTracker(layout)
+        pulses = tracker.feed(decoder.feed(wire(rng, layout, 9)).frames)
+        assert tracker.counts.closes
         assert not np.isinf(pulses["temperature_degc"]).any(), "a temperature is not finite"
 
 
@@ -497,30 +497,30 @@ def make_chain(rng: Generator) -> tuple[Setup, bytes]:
 
 
 def check_chain(setup: Setup, data: bytes, cuts: Cuts) -> None:
-    """The account closes at any moment; what comes out is finite, goes forward, and is the same in pieces."""
+    """The counts add up at any moment; what comes out is finite, goes forward, and is the same in pieces."""
     name, filter_name, size_effect = setup
     layout = SHIPPED[name]
     numbers = COEFFICIENTS if size_effect else replace(COEFFICIENTS, r_b=None)
-    books: list[Any] = []
+    outcomes: list[Any] = []
 
     def run(parts: list[bytes]) -> list[Records]:
-        decoder, accountant = CaptureDecoder(layout), Accountant(layout)
+        decoder, tracker = CaptureDecoder(layout), SequenceTracker(layout)
         compensator, out = Compensator(numbers, layout, FILTERS[filter_name]), []
         for feed in (*(functools.partial(decoder.feed, part) for part in parts), decoder.close):
-            out.append(compensator.feed(accountant.feed(feed())))
-            assert accountant.account.closes, f"{accountant.account} does not close"
-        books.append((accountant.account, decoder.rejected))
+            out.append(compensator.feed(tracker.feed(feed())))
+            assert tracker.counts.closes, f"{tracker.counts} does not add up"
+        outcomes.append((tracker.counts, decoder.rejected))
         return [np.concatenate([*out, compensator.close()])]
 
     (increments,) = both(run, data, cuts)
-    assert books[0] == books[1], f"whole: {books[0]}, in pieces: {books[1]}"
-    account, rejected = books[0]
-    assert len(increments) == account.good
+    assert outcomes[0] == outcomes[1], f"whole: {outcomes[0]}, in pieces: {outcomes[1]}"
+    counts, rejected = outcomes[0]
+    assert len(increments) == counts.good
     assert np.all(np.diff(increments["t_ns"]) > 0), "time goes back"
     require_finite(increments)
     if not layout.can:
         lost = sum(entry.length for entry in rejected.values())
-        assert layout.messages[0].length * account.frames + lost == len(data)
+        assert layout.messages[0].length * counts.frames + lost == len(data)
 
 
 def require_finite(increments: Records) -> None:

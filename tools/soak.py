@@ -4,7 +4,7 @@
     tools/run python tools/soak.py all
     tools/run python tools/soak.py loopback [--seconds 60]     also loopback-can, loopback-canfd
     tools/run python tools/soak.py fast [--seconds 5]          20 kHz
-    tools/run python tools/soak.py faults [--seconds 20]       one account, whichever way the bytes take
+    tools/run python tools/soak.py faults [--seconds 20]       the same counts, whichever way the bytes take
     tools/run python tools/soak.py kill [--times 20]           what a recording has after kill -9
     tools/run python tools/soak.py unplug [--seconds 15]       and a full disk, and consumers that are none
     tools/run python tools/soak.py hours [--hours 10]          in virtual time
@@ -42,7 +42,7 @@ from imudrv import cli, profiles
 from imudrv.calibration import write_calibration
 from imudrv.captures import Capture
 from imudrv.errors import InputError
-from imudrv.imu.accounting import Account
+from imudrv.imu.sequence import SampleCounts
 from imudrv.receive import receive
 from imudrv.recording import Recording
 from imudrv.records import INCREMENTS, PULSES, Flag, Records
@@ -375,10 +375,11 @@ def difference(left: Records, npz: Path) -> str:
     return ""
 
 
-def last_status(recording: Recording) -> tuple[Account, Status]:
-    """Account and status that a recording ends with."""
+def last_status(recording: Recording) -> tuple[SampleCounts, Status]:
+    """Sample counts and status that a recording ends with."""
     *_, (_, status) = recording.statuses()
-    return Account(**{name: status["account"][name] for name in Account.__dataclass_fields__}), status
+    samples = status["samples"]
+    return SampleCounts(**{name: samples[name] for name in SampleCounts.__dataclass_fields__}), status
 
 
 # The proofs
@@ -400,7 +401,7 @@ def loopback(folder: Path, seconds: float, profile: str = SERIAL, speed: float =
         code = service.stop()
         listener.stop()
     got: Records = np.load(folder / "got.npy")
-    account, status = last_status(Recording(folder / "run.mcap"))
+    counts, status = last_status(Recording(folder / "run.mcap"))
     said = done("compensate", folder / "run.mcap", "-o", folder / "offline.npz")
     differs = difference(got, folder / "offline.npz")
     percent = 100.0 * (seen[-1].cpu_s - seen[0].cpu_s) / seconds
@@ -413,11 +414,11 @@ def loopback(folder: Path, seconds: float, profile: str = SERIAL, speed: float =
             np.array_equal(got["counter"], np.arange(samples)),
         ),
         Check("the service ends well", f"exit code {code}", code == 0),
-        Check("the account closes", str(account), account.closes and account.good == samples),
+        Check("the counts add up", str(counts), counts.closes and counts.good == samples),
         Check(
             "bit-identical to `imudrv compensate` of the recording",
             differs or f"{len(got):,} rows, all columns, times and flags too",
-            not differs and f"  {account}" in said,
+            not differs and f"  {counts}" in said,
         ),
         measured("the unit", unit.said[-1].strip()),
         measured(
@@ -451,7 +452,7 @@ RANDOM_FAULTS: Final = {
 
 
 def faults(folder: Path, seconds: float, wires: Sequence[str] = tuple(profiles.shipped())) -> list[Check]:
-    """One scenario with every fault there is: one account, offline, live and from the recording."""
+    """One scenario with every fault there is: the same counts, offline, live and from the recording."""
     of_unit = {
         "silences": [{"at_s": 0.3 * seconds, "duration_s": 0.1 * seconds}],
         "counter_jumps": [{"at_s": 0.5 * seconds, "by": 40}, {"at_s": 0.7 * seconds, "by": -300}],
@@ -461,14 +462,14 @@ def faults(folder: Path, seconds: float, wires: Sequence[str] = tuple(profiles.s
     write_scenario(folder, seconds, of_unit)
     sums = set()
     for wire in wires:
-        account, _ = decoded(captured(folder, wire), wire)
-        lost = account.missing + account.damaged + account.torn
-        sums.add((account.expected, account.good + account.base, lost, account.restarts))
+        counts, _ = decoded(captured(folder, wire), wire)
+        lost = counts.missing + counts.damaged + counts.torn
+        sums.add((counts.expected, counts.good + counts.reference, lost, counts.restarts))
     return [
         *checks,
         Check(
-            f"without the line's own faults {len(wires)} wires have one account",
-            " and ".join("{} = {} good or base + {} lost, {} restarts".format(*each) for each in sums),
+            f"without the line's own faults {len(wires)} wires have the same counts",
+            " and ".join("{} = {} good or reference + {} lost, {} restarts".format(*each) for each in sums),
             len(sums) == 1,
         ),
     ]
@@ -489,9 +490,9 @@ def three_ways(folder: Path, wire: str) -> list[Check]:
     again = decoded(recording, wire)
     stretches = {name: tuple(kind.values()) for name, kind in status["rejected"].items()}
     return [
-        Check(f"{wire}: the account closes", str(offline), offline.closes and offline.lost > 0),
+        Check(f"{wire}: the counts add up", str(offline), offline.closes and offline.lost > 0),
         Check(
-            f"{wire}: {'bus' if is_can else 'pty'} and `imudrv run`, bucket by bucket",
+            f"{wire}: {'bus' if is_can else 'pty'} and `imudrv run`, count by count",
             "the same" if live == offline else str(live),
             live == offline,
         ),
@@ -515,13 +516,13 @@ def captured(folder: Path, wire: str) -> Path:
     return path
 
 
-def decoded(path: Path, wire: str) -> tuple[Account, dict[str, tuple[int, int]]]:
-    """Decode a capture as `imudrv decode` does: account, and stretches and length by reason."""
+def decoded(path: Path, wire: str) -> tuple[SampleCounts, dict[str, tuple[int, int]]]:
+    """Decode a capture as `imudrv decode` does: sample counts, and stretches and length by reason."""
     capture = Capture(path, profiles.load(wire))
     for _ in capture.pulses(lambda _: None):
         pass
     rejected = sorted(capture.rejected.items())
-    return capture.accountant.account, {
+    return capture.tracker.counts, {
         reason.name.lower(): (stretch.stretches, stretch.length) for reason, stretch in rejected
     }
 
@@ -729,7 +730,7 @@ def unplug(folder: Path, seconds: float, speed: float = 10.0) -> list[Check]:
         code = service.stop()
         listener.stop()
         recording = Recording(path)
-        account, status = last_status(recording)
+        counts, status = last_status(recording)
         own = np.concatenate(list(recording.increments()))
         reads = [(arrival.t_ns, len(arrival.data)) for arrival in recording.arrivals()]
         told_ns = next((t_ns for t_ns, s in recording.statuses() if s["port"]["state"] == "lost"), 0)
@@ -740,20 +741,20 @@ def unplug(folder: Path, seconds: float, speed: float = 10.0) -> list[Check]:
     delivered = int(unit.said[-1].split(", ")[1].split()[0]) // FRAME
     frames = sum(length for _, length in reads) // FRAME
     told_s = 1e-9 * (told_ns - max((t_ns for t_ns, _ in reads if t_ns <= told_ns), default=0))
-    back_s = (samples - account.good) / RATE_HZ / speed - out_s
+    back_s = (samples - counts.good) / RATE_HZ / speed - out_s
     nobody, client = status["sinks"][1:]
     differs = difference(own, folder / "offline.npz")
     return [
         Check("the service lives through it and ends well", f"exit code {code}", code == 0),
         Check(
-            "counted: the account closes, and good is what the unit's line took",
-            f"{account}; {delivered:,} delivered",
-            account.closes and account.expected == samples and account.good == delivered,
+            "counted: the counts add up, and good is what the unit's line took",
+            f"{counts}; {delivered:,} delivered",
+            counts.closes and counts.expected == samples and counts.good == delivered,
         ),
         Check(
             "flagged: the sample after the gap, downstream",
             f"{len(got):,} came, flagged {flagged.tolist()}",
-            len(got) == account.good and len(gaps) == 1 and gaps.tolist() == flagged.tolist(),
+            len(got) == counts.good and len(gaps) == 1 and gaps.tolist() == flagged.tolist(),
         ),
         Check(
             "a UDP receiver that is not there is told and counted",
@@ -763,7 +764,7 @@ def unplug(folder: Path, seconds: float, speed: float = 10.0) -> list[Check]:
         Check(
             "a TCP client that stops reading loses its own samples, counted",
             f"{client['dropped']:,} dropped, {client['queued']:,} wait",
-            client["dropped"] > 0 and client["sent"] + client["dropped"] + client["queued"] <= account.good,
+            client["dropped"] > 0 and client["sent"] + client["dropped"] + client["queued"] <= counts.good,
         ),
         Check(
             f"a full disk ({disk.kind}) is loud",
@@ -801,11 +802,11 @@ def hours(folder: Path, count: float) -> list[Check]:
         code = service.ended(DEADLINE_S + 600.0 * count)
         seen = watch.stop()
     taken_s = seen[-1].at_s - seen[0].at_s
-    books = service.heard("end: ").partition("end: ")[2]
+    summary = service.heard("end: ").partition("end: ")[2]
     all_good = f"{samples} samples by the counter = {samples} good; 0 duplicate, 0 restarts of the unit"
     return [
         Check("the service ends well", f"exit code {code}", code == 0),
-        Check("the account closes", books, books == all_good),
+        Check("the counts add up", summary, summary == all_good),
         measured(f"{count:g} h", f"{taken_s:.1f} s, {samples / taken_s / 1e6:.2f} M samples/s"),
         *memory(seen, 0.1 * taken_s),
     ]
@@ -825,10 +826,10 @@ PROOFS: Final = {
     "loopback-can": Proof(partial(loopback, profile="imu50-can"), "--seconds", 60, "from a CAN bus"),
     "loopback-canfd": Proof(partial(loopback, profile="imu50-canfd"), "--seconds", 60, "from CAN FD"),
     "fast": Proof(partial(loopback, speed=20.0), "--seconds", 5, "every sample at 20 kHz"),
-    "faults": Proof(faults, "--seconds", 20, "one account, whichever way the bytes take"),
+    "faults": Proof(faults, "--seconds", 20, "the same counts, whichever way the bytes take"),
     "kill": Proof(lambda folder, times: kill(folder, round(times)), "--times", 20, "what kill -9 leaves"),
     "unplug": Proof(unplug, "--seconds", 15, "cable out, disk full, consumers that are none"),
-    "hours": Proof(hours, "--hours", 10, "account and memory over hours of virtual time"),
+    "hours": Proof(hours, "--hours", 10, "counts and memory over hours of virtual time"),
 }
 
 

@@ -1,6 +1,10 @@
 """Frames to pulses to increments, pure: no I/O, no clock of its own, no settings files.
 
-accounting     counter, losses, running totals: FRAME -> PULSES, and where every sample went
+sequence       counter and losses: FRAME -> PULSES, and what became of every sample
+conversion     contents of a frame: increments or running totals, temperatures, status
+clock          host time of every sample
+coefficients   a calibration in SI units
+compensation   scale, misalignment, bias, temperature: PULSES -> INCREMENTS
 rate_filter    angular rate at the end of an interval from the increments around it
-compensation   K, C, bias, temperature and the size effect: PULSES -> INCREMENTS
+size_effect    velocity that the accelerometers sense because they lie apart
 """

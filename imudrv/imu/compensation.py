@@ -3,118 +3,98 @@
     dtheta_b = C_bg @ (k_g N_g) - b_g T
     dv_b     = C_ba @ (N_a / K - b_a T - dv_r)
 
-with the size effect of accelerometer i, sensing along a_i at r_i, over an interval T with the rates w0 and w1
-at its ends and wm = dtheta_b / T, or (w0 + w1) / 2 where the filter is to take dither out of it too:
-
-    dv_r,i = a_i . { (w1 - w0) x r_i + T/6 ([w0 x]^2 + 4 [wm x]^2 + [w1 x]^2) r_i }
-
-The tangential part telescopes, so that the quantisation of a rate never adds up in velocity. For speed both
-parts are written as inner products with what does not change: a . (d x r) = d . (r x a), and a . [w x]^2 r =
-sum of w_j w_k times the fixed `q` of a and r.
-
-The rates come from an FIR that needs neighbours. Where there are none (the first samples, those beside a gap)
-a sample is handed on without the size effect, its flag clear. A long interval, bridged by running totals,
-counts in the FIR as equal parts; as the tangential part telescopes, its error does not stay in velocity.
+Scale factors and biases follow the temperature. The size effect `dv_r` (`imudrv.imu.size_effect`) needs the
+angular rate at both ends of the interval, an FIR over the angle increments around them. Where the filter has
+too few neighbours (the first samples, those beside a gap) a sample is output without size-effect
+compensation, its flag clear. A long interval, recovered from running totals, enters the filter as equal
+parts, one for each sample interval; as the tangential part of the size effect telescopes, their error does
+not stay in velocity.
 """
 
-from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from imudrv.imu.coefficients import Coefficients
 from imudrv.imu.rate_filter import RateFilter
+from imudrv.imu.size_effect import (
+    SIZE_EFFECT,
+    SizeEffect,
+    dv_r,
+    size_effect_constants,
+    unpack_size_effect,
+)
 from imudrv.kernels import kernel
 from imudrv.records import INCREMENTS, Flag, Records
 from imudrv.units import NS
+from imudrv.vectors import Matrix, Vector, add, matrix, put, rotate, row, scale, subtract, times, vector_at
 from imudrv.wire.layout import Layout
 
 Array = NDArray[np.float64]
 
+MAX_TAPS: Final = 32
+"""Longest rate filter."""
 
-def _zeros() -> Array:
-    return np.zeros(3)
-
-
-@dataclass(frozen=True)
-class TemperatureTerms:
-    """How bias and scale follow the temperature.
-
-    Parameters
-    ----------
-    reference_degc, low_degc, high_degc : float
-        Where the terms vanish, and the range they were found in.
-    gyro_bias, gyro_scale, accelerometer_bias, accelerometer_scale : ndarray, shape (3,)
-        rad/s, 1, m/s^2 and 1 per kelvin.
-    """
-
-    reference_degc: float
-    low_degc: float
-    high_degc: float
-    gyro_bias: Array = field(default_factory=_zeros)
-    gyro_scale: Array = field(default_factory=_zeros)
-    accelerometer_bias: Array = field(default_factory=_zeros)
-    accelerometer_scale: Array = field(default_factory=_zeros)
-
-
-@dataclass(frozen=True)
-class Coefficients:
-    """A calibration in SI units, as the compensation reads it.
-
-    Parameters
-    ----------
-    gyro_scale : ndarray, shape (3,)
-        rad a pulse.
-    gyro_bias : ndarray, shape (3,)
-        rad/s, body axes.
-    C_bg : ndarray, shape (3, 3)
-        Gyro axes to body.
-    accelerometer_scale : ndarray, shape (3,)
-        Pulses per m/s.
-    accelerometer_bias : ndarray, shape (3,)
-        m/s^2, on the sensing axes.
-    C_ba : ndarray, shape (3, 3)
-        Accelerometer axes to body.
-    r_b : ndarray, shape (3, 3), optional
-        Row i: sensing point of accelerometer i, m, body axes. None: no size-effect compensation.
-    temperature : TemperatureTerms, optional
-        None: no temperature terms.
-    """
-
-    gyro_scale: Array
-    gyro_bias: Array
-    C_bg: Array
-    accelerometer_scale: Array
-    accelerometer_bias: Array
-    C_ba: Array
-    r_b: Array | None = None
-    temperature: TemperatureTerms | None = None
-
-
-# Where each constant begins in the kernel's array of constants.
-_KG, _BG, _CBG, _KA, _BA, _CBA, _C, _Q, _TREF, _KG_T, _BG_T, _KA_T, _BA_T, _T_ENDS = (
-    *(0, 3, 6, 15, 18, 21, 30, 39, 57),
-    *(60, 63, 66, 69, 72),
+CONSTANTS: Final = np.dtype(
+    [
+        ("gyro_scale", np.float64, 3),  # rad per pulse
+        ("gyro_bias", np.float64, 3),  # rad/s, body axes
+        ("C_bg", np.float64, (3, 3)),
+        ("accelerometer_scale", np.float64, 3),  # pulses per m/s
+        ("accelerometer_bias", np.float64, 3),  # m/s^2, sensing axes
+        ("C_ba", np.float64, (3, 3)),
+        ("reference_degc", np.float64),
+        ("low_degc", np.float64),  # above high_degc: no temperature compensation
+        ("high_degc", np.float64),
+        ("gyro_scale_per_k", np.float64, 3),  # relative
+        ("gyro_bias_per_k", np.float64, 3),
+        ("accelerometer_scale_per_k", np.float64, 3),  # relative
+        ("accelerometer_bias_per_k", np.float64, 3),
+        ("channels", np.int64, 4),  # temperatures of the gyros and of each accelerometer; -1: not measured
+        ("has_size_effect", np.bool_),
+        ("size_effect", SIZE_EFFECT),
+        ("interval_ns", np.int64),  # of one sample
+        ("lag", np.int64),  # of the rate filter, samples
+        ("length", np.int64),  # of its taps
+        ("taps", np.float64, MAX_TAPS),  # 1/s, oldest first
+    ],
+    align=True,
 )
-_CONSTANTS: Final = 73
-_NOTHING: Final = np.zeros(0, INCREMENTS)
+"""Constants of the kernels."""
 
+STATE: Final = np.dtype(
+    [
+        ("parts", np.int64),  # sample intervals since the last gap
+        ("head_end", np.int64),  # `parts` at the end of the first row that waits
+        ("rate_known", np.bool_),
+        ("rate", np.float64, 3),  # at the end of the last finished row, rad/s
+        ("slot", np.int64),  # of the oldest part in `history`
+        ("history", np.float64, (2 * MAX_TAPS, 3)),  # angles of the latest parts, see `_remember`
+    ],
+    align=True,
+)
+"""State of the kernels between calls."""
+
+_NOTHING: Final = np.zeros(0, INCREMENTS)
+_ZERO: Final = (0.0, 0.0, 0.0)
 _MISSING_BEFORE: Final = int(Flag.MISSING_BEFORE)
 _TEMPERATURE_RANGE: Final = int(Flag.TEMPERATURE_RANGE)
 _SIZE_EFFECT: Final = int(Flag.SIZE_EFFECT)
 
 
 class Compensator:
-    """Compensation of one unit's pulses; feed them in any pieces, the output is the same bits.
+    """Compensation of one unit's pulses; any cut of them into pieces gives the same bits.
 
     Parameters
     ----------
     coefficients : Coefficients
         The calibration.
     layout : Layout
-        Of the profile: sample interval and temperature channels.
+        Sample interval and temperature channels of the profile.
     rate_filter : RateFilter
-        For the size effect. Its lag holds increments back only where there is a size effect to compensate.
+        For the size effect, of at most `MAX_TAPS` taps. Its lag delays increments only where there is a size
+        effect to compensate.
 
     Attributes
     ----------
@@ -123,24 +103,15 @@ class Compensator:
     """
 
     def __init__(self, coefficients: Coefficients, layout: Layout, rate_filter: RateFilter) -> None:
-        self._interval_ns = layout.interval_ns
         self.has_size_effect = coefficients.r_b is not None
-        self._constants = _constants(coefficients)
-        if rate_filter.middle_from_ends:
-            self._constants[_T_ENDS] = layout.interval_ns * NS
-        terms = coefficients.temperature
-        self._range = (terms.low_degc, terms.high_degc) if terms else (np.inf, -np.inf)
-        self._channels = _temperature_channels(layout) if terms else np.full(4, -1, np.int64)
-        self._taps = rate_filter.taps / (layout.interval_ns * NS)
+        self._constants = _constants(coefficients, layout, rate_filter)
+        self._state = np.zeros(1, STATE)
         self._lag = rate_filter.lag
-        self._history = np.zeros((2 * len(rate_filter.taps), 3))
-        self._rate = np.zeros(3)
-        self._state = np.zeros(4, np.int64)
         self._waiting = _NOTHING
 
     @property
     def lag(self) -> int:
-        """Samples by which the output is late."""
+        """Delay of the output, samples."""
         return self._lag if self.has_size_effect else 0
 
     def feed(self, pulses: Records) -> Records:
@@ -154,77 +125,52 @@ class Compensator:
         Returns
         -------
         ndarray of INCREMENTS
-            What is ready; `t_ns` is the time by the counter, `elapsed_ns` of the pulses.
+            Those that are ready; `t_ns` is the time by the counter, `elapsed_ns` of the pulses.
         """
         waiting = len(self._waiting)
         out = np.empty(waiting + len(pulses), INCREMENTS)
         if waiting:
             out[:waiting] = self._waiting
-        ready = _compensate(
-            pulses,
-            out,
-            waiting,
-            self._constants,
-            self._channels,
-            self._range,
-            self.has_size_effect,
-            self._interval_ns,
-            self._taps,
-            self._lag,
-            self._history,
-            self._rate,
-            self._state,
-        )
+        ready = _compensate(pulses, out, waiting, self._constants, self._state)
         self._waiting = out[ready:].copy() if ready < len(out) else _NOTHING
         return out[:ready]
 
     def close(self) -> Records:
-        """End of the stream: increments that still wait for a rate, without their size effect."""
+        """End the stream.
+
+        Returns
+        -------
+        ndarray of INCREMENTS
+            Those that still waited for a rate, without size-effect compensation.
+        """
         rest, self._waiting = self._waiting, _NOTHING
-        _finish_all(rest, self._constants)
-        self._state[:] = 0
+        _finish_plainly(rest, matrix(self._constants[0]["C_ba"]))
+        self._state = np.zeros(1, STATE)
         return rest
 
 
-def _constants(c: Coefficients) -> Array:
-    constants = np.zeros(_CONSTANTS)
-
-    def put(at: int, values: Array) -> None:
-        constants[at : at + values.size] = values.ravel()
-
-    put(_KG, c.gyro_scale)
-    put(_BG, c.gyro_bias)
-    put(_CBG, c.C_bg)
-    put(_KA, c.accelerometer_scale)
-    put(_BA, c.accelerometer_bias)
-    put(_CBA, c.C_ba)
+def _constants(c: Coefficients, layout: Layout, rate_filter: RateFilter) -> Records:
+    """Fill in the one row of `CONSTANTS`."""
+    constants = np.zeros(1, CONSTANTS)
+    k = constants[0]
+    k["gyro_scale"], k["gyro_bias"], k["C_bg"] = c.gyro_scale, c.gyro_bias, c.C_bg
+    k["accelerometer_scale"], k["accelerometer_bias"] = c.accelerometer_scale, c.accelerometer_bias
+    k["C_ba"] = c.C_ba
+    k["low_degc"], k["high_degc"], k["channels"] = np.inf, -np.inf, -1
+    if (t := c.temperature) is not None:
+        k["reference_degc"], k["low_degc"], k["high_degc"] = t.reference_degc, t.low_degc, t.high_degc
+        k["gyro_scale_per_k"], k["gyro_bias_per_k"] = t.gyro_scale, t.gyro_bias
+        k["accelerometer_scale_per_k"] = t.accelerometer_scale
+        k["accelerometer_bias_per_k"] = t.accelerometer_bias
+        k["channels"] = _temperature_channels(layout)
+    interval_s, taps = layout.interval_ns * NS, rate_filter.taps
+    k["interval_ns"], k["lag"], k["length"] = layout.interval_ns, rate_filter.lag, len(taps)
+    k["taps"][: len(taps)] = taps / interval_s
     if c.r_b is not None:
-        a_b = np.linalg.inv(c.C_ba)
-        put(_C, np.cross(c.r_b, a_b))
-        put(_Q, np.array([_centripetal(a, r) for a, r in zip(a_b, c.r_b, strict=True)]))
-    if c.temperature is not None:
-        constants[_TREF] = c.temperature.reference_degc
-        put(_KG_T, c.temperature.gyro_scale)
-        put(_BG_T, c.temperature.gyro_bias)
-        put(_KA_T, c.temperature.accelerometer_scale)
-        put(_BA_T, c.temperature.accelerometer_bias)
+        mean_of_ends_s = interval_s if rate_filter.middle_from_ends else 0.0
+        k["has_size_effect"] = True
+        k["size_effect"] = size_effect_constants(c.C_ba, c.r_b, mean_of_ends_s)[0]
     return constants
-
-
-def _centripetal(a: Array, r: Array) -> Array:
-    """Factors of (w_x^2, w_y^2, w_z^2, w_x w_y, w_y w_z, w_z w_x) in a . (w (w . r) - r (w . w))."""
-    ar = a * r
-    x, y, z = 0, 1, 2
-    return np.array(
-        [
-            -ar[y] - ar[z],
-            -ar[z] - ar[x],
-            -ar[x] - ar[y],
-            a[x] * r[y] + a[y] * r[x],
-            a[y] * r[z] + a[z] * r[y],
-            a[z] * r[x] + a[x] * r[z],
-        ]
-    )
 
 
 def _temperature_channels(layout: Layout) -> NDArray[np.int64]:
@@ -238,259 +184,219 @@ def _temperature_channels(layout: Layout) -> NDArray[np.int64]:
     return np.array([channel("gyro"), *accelerometers], np.int64)
 
 
-@kernel
-def _rotate(m, at, x, y, z):  # type: ignore[no-untyped-def]
-    """Multiply a vector by the 3x3 matrix that begins at `at` of `m`."""
-    return (
-        m[at] * x + m[at + 1] * y + m[at + 2] * z,
-        m[at + 3] * x + m[at + 4] * y + m[at + 5] * z,
-        m[at + 6] * x + m[at + 7] * y + m[at + 8] * z,
-    )
+class _AtTemperature(NamedTuple):
+    """Scale and bias of all axes at a temperature."""
+
+    gyro_scale: Vector  # rad per pulse
+    gyro_bias: Vector  # rad/s
+    accelerometer_scale: Vector  # m/s per pulse
+    accelerometer_bias: Vector  # m/s^2
+    in_range: bool
 
 
 @kernel
-def _compensate(  # type: ignore[no-untyped-def]
-    pulses, out, filled, m, channels, limits, size_effect, interval_ns, taps, lag, history, rate, state
-):
-    """Append one increment a row of `pulses` behind the `filled` ones of `out`; how many are then ready.
+def _compensate(pulses: Records, out: Records, waiting: int, constants: Records, state: Records) -> int:
+    """Append an increment for each of the pulses to the `waiting` ones in `out`; return how many are ready.
 
-    The first `filled` rows wait for the rate at their end. Until it is known a row has in `dv_b` what its
-    accelerometers felt, on their own axes.
+    The `dv_b` of a row that waits for its rate still is on the axes of the accelerometers.
     """
-    _scale(pulses, out[filled:], m, channels, limits)
-    if size_effect:
-        return _move(out, filled, m, interval_ns, taps, lag, history, rate, state)
-    _finish_all(out, m)
-    return out.shape[0]
+    c, s = constants[0], state[0]
+    _scale(pulses, out[waiting:], c)
+    if c["has_size_effect"]:
+        return _remove_size_effect(out, waiting, c, s)
+    _finish_plainly(out, matrix(c["C_ba"]))
+    return len(out)
 
 
 @kernel
-def _scale(pulses, out, m, channels, limits):  # type: ignore[no-untyped-def]
-    """Scale, bias and temperature; the gyros to body axes."""
-    if pulses.shape[0] == 0:
+def _scale(pulses: Records, out: Records, c: np.void) -> None:
+    """Apply scale, bias and temperature; rotate the angles into body axes."""
+    if len(pulses) == 0:
         return
-    c = pulses[0]["temperature_degc"]
-    terms = _at_temperature(c, m, channels, limits)
-    (k0, k1, k2), (b0, b1, b2), (s0, s1, s2), (a0, a1, a2), in_range = terms
-    for i in range(pulses.shape[0]):
-        p, row = pulses[i], out[i]
-        T = p["interval_ns"] * NS
-        if _differ(p["temperature_degc"], c, channels):
-            c = p["temperature_degc"]
-            terms = _at_temperature(c, m, channels, limits)
-            (k0, k1, k2), (b0, b1, b2), (s0, s1, s2), (a0, a1, a2), in_range = terms
-        d0, d1, d2 = _rotate(m, _CBG, p["gyro"][0] * k0, p["gyro"][1] * k1, p["gyro"][2] * k2)
-        row["dtheta_b"][0], row["dtheta_b"][1], row["dtheta_b"][2] = d0 - b0 * T, d1 - b1 * T, d2 - b2 * T
-        row["dv_b"][0] = p["accelerometer"][0] * s0 - a0 * T
-        row["dv_b"][1] = p["accelerometer"][1] * s1 - a1 * T
-        row["dv_b"][2] = p["accelerometer"][2] * s2 - a2 * T
-        row["counter"], row["t_ns"], row["interval_ns"] = p["counter"], p["elapsed_ns"], p["interval_ns"]
-        row["flags"] = p["flags"] if in_range else p["flags"] | _TEMPERATURE_RANGE
+    C_bg, channels = matrix(c["C_bg"]), c["channels"]
+    degc = pulses[0]["temperature_degc"]
+    at = _at_temperature(degc, c)
+    for i in range(len(pulses)):
+        sample, increment = pulses[i], out[i]
+        T = sample["interval_ns"] * NS
+        if _differ(sample["temperature_degc"], degc, channels):
+            degc = sample["temperature_degc"]
+            at = _at_temperature(degc, c)
+        gyro = times(vector_at(sample["gyro"], 0), at.gyro_scale)
+        accelerometer = times(vector_at(sample["accelerometer"], 0), at.accelerometer_scale)
+        put(increment["dtheta_b"], 0, subtract(rotate(C_bg, gyro), scale(T, at.gyro_bias)))
+        put(increment["dv_b"], 0, subtract(accelerometer, scale(T, at.accelerometer_bias)))
+        increment["counter"], increment["t_ns"] = sample["counter"], sample["elapsed_ns"]
+        increment["interval_ns"] = sample["interval_ns"]
+        increment["flags"] = sample["flags"] if at.in_range else sample["flags"] | _TEMPERATURE_RANGE
 
 
 @kernel
-def _move(out, filled, m, interval_ns, taps, lag, history, rate, state):  # type: ignore[no-untyped-def]
-    """Finish the rows of `out` whose rates become known; the rows from `filled` on are new."""
-    ready = 0
-    parts, slot, head_end, rate_known = state[0], state[1], state[2], state[3] != 0
-    x0, x1, x2 = rate[0], rate[1], rate[2]
-    length = taps.shape[0]
-    i = filled
-    single = 0  # rows of one interval each, unbroken, that stand in `out` right before row i
-    while i < out.shape[0]:
+def _remove_size_effect(out: Records, waiting: int, c: np.void, s: np.void) -> int:
+    """Finish the rows of `out` whose rates become known; return how many. The first `waiting` are not new."""
+    interval_ns, lag, length, taps = c["interval_ns"], c["lag"], c["length"], c["taps"]
+    C_ba, effect = matrix(c["C_ba"]), unpack_size_effect(c["size_effect"])
+    parts, head_end, slot, history = s["parts"], s["head_end"], s["slot"], s["history"]
+    rate_known, w0 = s["rate_known"], vector_at(s["rate"], 0)
+    ready, i = 0, waiting
+    single = 0  # rows of one interval each, without a gap, right before row i in `out`
+    while i < len(out):
         if single >= length and rate_known:
             first = i
-            i, x0, x1, x2 = _move_steadily(out, i, m, interval_ns, taps, lag, x0, x1, x2)
+            i, w0 = _remove_steadily(out, i, c, effect, C_ba, w0)
             for k in range(max(first, i - length), i):
-                part = out[k]
-                d0, d1, d2 = part["dtheta_b"][0], part["dtheta_b"][1], part["dtheta_b"][2]
-                slot = _remember(history, slot, d0, d1, d2)
+                slot = _remember(history, slot, length, vector_at(out[k]["dtheta_b"], 0))
             parts += i - first
             ready += i - first
             head_end = parts - lag + 1
             single = 0
             continue
-        row = out[i]
-        if row["flags"] & _MISSING_BEFORE:
-            _finish_all(out[ready:i], m)
+        new = out[i]
+        if new["flags"] & _MISSING_BEFORE:
+            _finish_plainly(out[ready:i], C_ba)
             ready, parts, rate_known, single = i, 0, False, 0
-        steps = 1 if row["interval_ns"] == interval_ns else row["interval_ns"] // interval_ns
-        d0, d1, d2 = row["dtheta_b"][0], row["dtheta_b"][1], row["dtheta_b"][2]
+        steps = 1 if new["interval_ns"] == interval_ns else new["interval_ns"] // interval_ns
+        dtheta = vector_at(new["dtheta_b"], 0)
         if steps > 1:
-            d0, d1, d2 = d0 / steps, d1 / steps, d2 / steps
+            dtheta = dtheta[0] / steps, dtheta[1] / steps, dtheta[2] / steps
         if ready == i:
             head_end = parts + steps
         for _ in range(steps):
-            slot = _remember(history, slot, d0, d1, d2)
+            slot = _remember(history, slot, length, dtheta)
             parts += 1
             if ready > i or head_end != parts - lag:
                 continue
             head = out[ready]
             known = parts >= length
-            if known:
-                y0, y1, y2 = _fir(taps, history, slot)
-            else:
-                y0 = y1 = y2 = 0.0
+            w1 = _end_rate(taps, length, history, slot) if known else _ZERO
             if known and rate_known:
-                head["flags"] |= _SIZE_EFFECT
-                m0, m1, m2 = head["dtheta_b"][0], head["dtheta_b"][1], head["dtheta_b"][2]
-                e0, e1, e2 = _size_effect(m, head["interval_ns"] * NS, x0, x1, x2, m0, m1, m2, y0, y1, y2)
-                _finish(head, m, e0, e1, e2)
+                _finish_compensated(head, C_ba, effect, head["interval_ns"] * NS, w0, w1)
             else:
-                _finish(head, m, 0.0, 0.0, 0.0)
-            x0, x1, x2, rate_known = y0, y1, y2, known
+                _finish(head, C_ba, _ZERO)
+            w0, rate_known = w1, known
             ready += 1
             if ready <= i:
-                after = out[ready]["interval_ns"]
-                head_end += 1 if after == interval_ns else after // interval_ns
+                following_ns = out[ready]["interval_ns"]
+                head_end += 1 if following_ns == interval_ns else following_ns // interval_ns
         single = single + 1 if steps == 1 else 0
         i += 1
-    state[0], state[1], state[2], state[3] = parts, slot, head_end, rate_known
-    rate[0], rate[1], rate[2] = x0, x1, x2
+    s["parts"], s["head_end"], s["slot"], s["rate_known"] = parts, head_end, slot, rate_known
+    put(s["rate"], 0, w0)
     return ready
 
 
 @kernel
-def _move_steadily(out, i, m, interval_ns, taps, lag, x0, x1, x2):  # type: ignore[no-untyped-def]
-    """Finish rows while rows of one interval each come unbroken: the same bits as `_move`, in half the time.
+def _remove_steadily(
+    out: Records, i: int, c: np.void, effect: SizeEffect, C_ba: Matrix, w0: Vector
+) -> tuple[int, Vector]:
+    """Finish rows while single intervals follow each other; return the first other row, and the last rate.
 
-    The rows that the filter needs all stand in `out`. Gives the first row that is not so, and the rate at the
-    end of the last one that was finished.
+    The same bits as `_remove_size_effect` in half the time: the rows that the filter needs are all in `out`.
     """
-    length = taps.shape[0]
+    interval_ns, lag, length, taps = c["interval_ns"], c["lag"], c["length"], c["taps"]
     T = interval_ns * NS
-    while i < out.shape[0]:
-        row = out[np.uint64(i)]
-        if row["interval_ns"] != interval_ns or row["flags"] & _MISSING_BEFORE:
+    while i < len(out):
+        new = out[np.uint64(i)]  # unsigned: no test for an index from the end
+        if new["interval_ns"] != interval_ns or new["flags"] & _MISSING_BEFORE:
             break
-        y0 = y1 = y2 = 0.0
+        w1 = _ZERO
         for j in range(length):
-            part, h = out[np.uint64(i + 1 - length + j)], taps[np.uint64(j)]
-            y0 += h * part["dtheta_b"][0]
-            y1 += h * part["dtheta_b"][1]
-            y2 += h * part["dtheta_b"][2]
-        head = out[np.uint64(i - lag)]
-        head["flags"] |= _SIZE_EFFECT
-        m0, m1, m2 = head["dtheta_b"][0], head["dtheta_b"][1], head["dtheta_b"][2]
-        e0, e1, e2 = _size_effect(m, T, x0, x1, x2, m0, m1, m2, y0, y1, y2)
-        _finish(head, m, e0, e1, e2)
-        x0, x1, x2 = y0, y1, y2
+            dtheta = out[np.uint64(i + 1 - length + j)]["dtheta_b"]
+            w1 = add(w1, scale(taps[np.uint64(j)], vector_at(dtheta, 0)))
+        _finish_compensated(out[np.uint64(i - lag)], C_ba, effect, T, w0, w1)
+        w0 = w1
         i += 1
-    return i, x0, x1, x2
+    return i, w0
 
 
 @kernel
-def _remember(history, slot, d0, d1, d2):  # type: ignore[no-untyped-def]
-    """Put an angle in the place of the oldest one; the next place."""
-    length = history.shape[0] // 2
-    # Kept twice, so that the latest ones always stand in a row.
+def _finish_compensated(
+    increment: np.void, C_ba: Matrix, effect: SizeEffect, T: float, w0: Vector, w1: Vector
+) -> None:
+    """Subtract the size effect and rotate the velocity into body axes."""
+    increment["flags"] |= _SIZE_EFFECT
+    _finish(increment, C_ba, dv_r(effect, T, w0, vector_at(increment["dtheta_b"], 0), w1))
+
+
+@kernel
+def _finish(increment: np.void, C_ba: Matrix, excess: Vector) -> None:
+    put(increment["dv_b"], 0, rotate(C_ba, subtract(vector_at(increment["dv_b"], 0), excess)))
+
+
+@kernel
+def _finish_plainly(rows: Records, C_ba: Matrix) -> None:
+    """Rotate the velocity of rows into body axes, the size effect in it."""
+    for i in range(len(rows)):
+        _finish(rows[i], C_ba, _ZERO)
+
+
+@kernel
+def _end_rate(taps: Array, length: int, history: Array, oldest: int) -> Vector:
+    """Rate at the end of the part `lag` before the newest one, rad/s."""
+    w = _ZERO
+    for j in range(length):
+        w = add(w, scale(taps[j], row(history, oldest + j)))
+    return w
+
+
+@kernel
+def _remember(history: Array, slot: int, length: int, dtheta: Vector) -> int:
+    """Put an angle in the place of the oldest one; return the next place.
+
+    Each is stored twice, so that the latest `length` ones always are in sequence.
+    """
     for at in (slot, slot + length):
-        history[at, 0], history[at, 1], history[at, 2] = d0, d1, d2
+        history[at, 0], history[at, 1], history[at, 2] = dtheta
     return slot + 1 if slot + 1 < length else 0
 
 
 @kernel
-def _differ(degc, before, channels):  # type: ignore[no-untyped-def]
-    """Whether a temperature that counts is another than before."""
-    for k in range(channels.shape[0]):
+def _differ(degc: Array, before: Array, channels: NDArray[np.int64]) -> bool:
+    """Whether a temperature that is used has changed."""
+    for k in range(len(channels)):  # noqa: SIM110  numba does not compile any()
         if channels[k] >= 0 and degc[channels[k]] != before[channels[k]]:
             return True
     return False
 
 
 @kernel
-def _at_temperature(degc, m, channels, limits):  # type: ignore[no-untyped-def]
-    """Give rad a pulse, gyro bias, m/s a pulse, accelerometer bias; whether all temperatures are in range."""
-    low, high = limits
-    kelvin = (0.0, 0.0, 0.0, 0.0)
-    in_range = True
+def _at_temperature(degc: Array, c: np.void) -> _AtTemperature:
+    """Scale and bias at a sample's temperatures."""
+    low, high, channels = c["low_degc"], c["high_degc"], c["channels"]
+    gyro, accelerometer, in_range = 0.0, _ZERO, True  # kelvins from the reference
     if low <= high:
-        kelvin = (
-            _kelvin(degc, channels[0], m[_TREF]),
-            _kelvin(degc, channels[1], m[_TREF]),
-            _kelvin(degc, channels[2], m[_TREF]),
-            _kelvin(degc, channels[3], m[_TREF]),
+        reference = c["reference_degc"]
+        gyro = _kelvin(degc, channels[0], reference)
+        accelerometer = (
+            _kelvin(degc, channels[1], reference),
+            _kelvin(degc, channels[2], reference),
+            _kelvin(degc, channels[3], reference),
         )
-        for channel in channels:
-            in_range = in_range and channel >= 0 and low <= degc[channel] <= high
-    g, x, y, z = kelvin
-    return (
-        (_scaled(m, _KG, _KG_T, g), _scaled(m, _KG + 1, _KG_T + 1, g), _scaled(m, _KG + 2, _KG_T + 2, g)),
-        (m[_BG] + m[_BG_T] * g, m[_BG + 1] + m[_BG_T + 1] * g, m[_BG + 2] + m[_BG_T + 2] * g),
-        (
-            1.0 / _scaled(m, _KA, _KA_T, x),
-            1.0 / _scaled(m, _KA + 1, _KA_T + 1, y),
-            1.0 / _scaled(m, _KA + 2, _KA_T + 2, z),
+        for k in range(len(channels)):
+            in_range = in_range and channels[k] >= 0 and low <= degc[channels[k]] <= high
+    K = _scale_at(c["accelerometer_scale"], c["accelerometer_scale_per_k"], accelerometer)
+    return _AtTemperature(
+        _scale_at(c["gyro_scale"], c["gyro_scale_per_k"], (gyro, gyro, gyro)),
+        add(vector_at(c["gyro_bias"], 0), scale(gyro, vector_at(c["gyro_bias_per_k"], 0))),
+        (1.0 / K[0], 1.0 / K[1], 1.0 / K[2]),
+        add(
+            vector_at(c["accelerometer_bias"], 0),
+            times(accelerometer, vector_at(c["accelerometer_bias_per_k"], 0)),
         ),
-        (m[_BA] + m[_BA_T] * x, m[_BA + 1] + m[_BA_T + 1] * y, m[_BA + 2] + m[_BA_T + 2] * z),
         in_range,
     )
 
 
 @kernel
-def _scaled(m, at, at_term, kelvin):  # type: ignore[no-untyped-def]
-    """Give a scale factor at a temperature."""
-    return m[at] * (1.0 + m[at_term] * kelvin)
+def _scale_at(reference: Array, per_k: Array, kelvin: Vector) -> Vector:
+    """Scale factors that far from the reference temperature."""
+    change = times(vector_at(per_k, 0), kelvin)
+    return times(vector_at(reference, 0), (1.0 + change[0], 1.0 + change[1], 1.0 + change[2]))
 
 
 @kernel
-def _kelvin(degc, channel, reference):  # type: ignore[no-untyped-def]
-    """Kelvins from the reference; none where the temperature is not known."""
+def _kelvin(degc: Array, channel: int, reference_degc: float) -> float:
+    """Temperature above the reference; 0 where it is not known."""
     if channel < 0 or np.isnan(degc[channel]):
         return 0.0
-    return degc[channel] - reference
-
-
-@kernel
-def _fir(taps, history, begin):  # type: ignore[no-untyped-def]
-    """Rate at the end of the part `lag` before the newest, rad/s."""
-    w0 = w1 = w2 = 0.0
-    for j in range(taps.shape[0]):
-        w0 += taps[j] * history[begin + j, 0]
-        w1 += taps[j] * history[begin + j, 1]
-        w2 += taps[j] * history[begin + j, 2]
-    return w0, w1, w2
-
-
-@kernel
-def _size_effect(m, T, x0, x1, x2, d0, d1, d2, y0, y1, y2):  # type: ignore[no-untyped-def]
-    """dv_r of the three accelerometers, m/s, from the rates x and y at the ends and the angle d between."""
-    # z is twice the rate between, so that its square counts four times. A bridged interval has its own angle:
-    # the rate bends in it, and over many intervals dither cancels.
-    if m[_T_ENDS] == T:
-        z0, z1, z2 = x0 + y0, x1 + y1, x2 + y2
-    else:
-        k = 2.0 / T
-        z0, z1, z2 = k * d0, k * d1, k * d2
-    s0 = x0 * x0 + y0 * y0 + z0 * z0
-    s1 = x1 * x1 + y1 * y1 + z1 * z1
-    s2 = x2 * x2 + y2 * y2 + z2 * z2
-    s3 = x0 * x1 + y0 * y1 + z0 * z1
-    s4 = x1 * x2 + y1 * y2 + z1 * z2
-    s5 = x2 * x0 + y2 * y0 + z2 * z0
-    t0, t1, t2 = _rotate(m, _C, y0 - x0, y1 - x1, y2 - x2)
-    sixth = T * (1.0 / 6.0)
-    return (
-        t0 + sixth * _inner(m, _Q, s0, s1, s2, s3, s4, s5),
-        t1 + sixth * _inner(m, _Q + 6, s0, s1, s2, s3, s4, s5),
-        t2 + sixth * _inner(m, _Q + 12, s0, s1, s2, s3, s4, s5),
-    )
-
-
-@kernel
-def _inner(m, at, s0, s1, s2, s3, s4, s5):  # type: ignore[no-untyped-def]
-    return m[at] * s0 + m[at + 1] * s1 + m[at + 2] * s2 + m[at + 3] * s3 + m[at + 4] * s4 + m[at + 5] * s5
-
-
-@kernel
-def _finish(row, m, e0, e1, e2):  # type: ignore[no-untyped-def]
-    """Take the size effect e off what the accelerometers felt, and turn it into body axes."""
-    v0, v1, v2 = row["dv_b"][0] - e0, row["dv_b"][1] - e1, row["dv_b"][2] - e2
-    row["dv_b"][0], row["dv_b"][1], row["dv_b"][2] = _rotate(m, _CBA, v0, v1, v2)
-
-
-@kernel
-def _finish_all(rows, m):  # type: ignore[no-untyped-def]
-    """Finish rows without a size effect."""
-    for i in range(rows.shape[0]):
-        _finish(rows[i], m, 0.0, 0.0, 0.0)
+    return float(degc[channel]) - reference_degc

@@ -1,7 +1,7 @@
 """Angular rate at an interval's end: an FIR over the angle increments around it (mathematics, section 1).
 
-``omega(end of k) = 1/tau sum_j h_j dtheta_{k+j}``, j = -M..L. L is the lag: so many samples later the
-compensated increment comes out, angle and velocity alike.
+``omega(end of k) = 1/tau sum_j h_j dtheta_{k+j}``, j = -M..L. L is the lag: the compensated increment, angle
+and velocity alike, is output L samples later.
 """
 
 from dataclasses import dataclass
@@ -18,8 +18,8 @@ NAMES: Final[tuple[RateFilterName, ...]] = ("causal", "centred", "dither")
 DITHER_HZ: Final = 400.0
 """Dither frequency of a 50-type block, Hz."""
 DITHER_BAND_HZ: Final = 30.0
-"""How far from it the blocks' own frequencies may lie, Hz."""
-_LOWEST: Final = 0.2
+"""Largest deviation of a block's own frequency from it, Hz."""
+_LOWEST: Final = 0.2  # of the sample rate: aliased dither below it cannot be separated from motion
 _STOP_TAPS: Final = 13
 
 
@@ -30,14 +30,14 @@ class RateFilter:
     Parameters
     ----------
     name : str
-        How users call it.
+        Name for users.
     taps : ndarray, shape (M + 1 + lag,)
         h_j from the oldest, j = -M, to the newest, j = lag.
     lag : int
-        Samples by which the output is late.
+        Delay of the output, samples.
     middle_from_ends : bool
-        Whether the rate in the middle of an interval, too, comes from the filter, as the mean of those at its
-        ends; else it is the interval's own angle over its length, with all the dither that is in it.
+        Whether the rate in the middle of an interval is the mean of the filtered rates at its ends; otherwise
+        it is the interval's own angle over its length, with all the dither in it.
     """
 
     name: RateFilterName
@@ -53,7 +53,7 @@ def rate_filter(name: RateFilterName, interval_ns: int) -> RateFilter:
     ----------
     name : {'causal', 'centred', 'dither'}
         ``causal``: no lag, exact for a rate quadratic in time. ``centred``: lag 1, exact for a linear one, a
-        third of the noise. ``dither``: lag 8, exact for a quadratic one, takes out what a raw block leaves in
+        third of the noise. ``dither``: lag 8, exact for a quadratic one, removes what a raw block leaves in
         the increments at 370-430 Hz.
     interval_ns : int
         Sample interval, ns.
@@ -66,7 +66,7 @@ def rate_filter(name: RateFilterName, interval_ns: int) -> RateFilter:
     Raises
     ------
     InputError
-        ``dither`` at a sample rate at which the dither is aliased into the motion.
+        ``dither`` at a sample rate that aliases the dither into the motion.
     """
     if name == "causal":
         return RateFilter(name, np.array([2.0, -7.0, 11.0]) / 6.0, 0)
@@ -85,18 +85,18 @@ def rate_filter(name: RateFilterName, interval_ns: int) -> RateFilter:
 
 
 def _dither_taps(centre: float, width: float) -> NDArray[np.float64]:
-    """Pass least, in the worst case, within `width` of `centre`; exact for a rate up to quadratic in time.
+    """Minimise the largest gain within `width` of `centre`; exact for a rate up to quadratic in time.
 
-    Frequencies are in parts of the sample rate. An equiripple stop filter (Parks-McClellan; its pass band is
-    next to nothing, so that all its zeros go to the dither) is folded with four taps p, q, q, p, which put
-    the whole about the interval's end and make it exact. Tap j weighs the mean rate over an interval centred
-    c = j - 1/2 intervals from the end. A constant rate asks for sum h = 1; a quadratic one, whose mean over
-    that interval is proportional to c^2 + 1/12, for sum h c^2 = -1/12; odd powers vanish by symmetry. The
-    second moments of folded filters add.
+    Frequencies are fractions of the sample rate. An equiripple stop filter (Parks-McClellan; with hardly any
+    pass band, so that all its zeros go to the dither) is convolved with four taps p, q, q, p, which centre
+    the whole at the interval's end and make it exact. Tap j weighs the mean rate over an interval centred
+    c = j - 1/2 intervals from the end. A constant rate requires sum h = 1; a quadratic one, whose mean over
+    that interval is proportional to c^2 + 1/12, sum h c^2 = -1/12; odd powers vanish by symmetry. The second
+    moments of convolved filters add.
 
-    At 1 kHz 4e-9 of what is at 370-430 Hz gets through; a rate at 3 Hz is told 2.5e-7 too small.
+    At 1 kHz 4e-9 of what is at 370-430 Hz passes; a rate at 3 Hz comes out 2.5e-7 too small.
     """
-    from scipy.signal import remez  # here, for it takes most of a second to load
+    from scipy.signal import remez  # here, because it takes most of a second to load
 
     nearest, farthest = centre - width, min(centre + width, 0.5)
     stop = remez(_STOP_TAPS, [0.0, 1e-3, nearest, farthest], [1.0, 0.0])

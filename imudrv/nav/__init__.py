@@ -1,6 +1,5 @@
 """Strapdown mathematics, pure: no files, no clock, no settings; kernels that live and offline code share.
 
-vectors        algebra on 3-tuples, inside numba kernels
 attitude       rotations
 earth          WGS-84: gravity, rotation, radii
 alignment      attitude of a unit that stands still

@@ -52,9 +52,9 @@ from imudrv.nav.attitude import (
 )
 from imudrv.nav.earth import EARTH_RATE, earth_rate_n
 from imudrv.nav.mechanisation import body_step
-from imudrv.nav.vectors import add, put, vector_at
 from imudrv.records import Records
 from imudrv.units import DEG, NS, NS_PER_S
+from imudrv.vectors import add, put, vector_at
 
 Array = NDArray[np.float64]
 

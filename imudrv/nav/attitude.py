@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imudrv.kernels import kernel
-from imudrv.nav.vectors import Vector, add, cross, dot, scale
+from imudrv.vectors import Vector, add, cross, dot, scale
 
 Quaternion: TypeAlias = tuple[float, float, float, float]
 

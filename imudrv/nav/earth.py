@@ -8,7 +8,7 @@ from math import cos, sin, sqrt
 from typing import Final
 
 from imudrv.kernels import kernel
-from imudrv.nav.vectors import Vector
+from imudrv.vectors import Vector
 
 EARTH_RATE: Final = 7.292115e-5
 """Rotation rate of the Earth, rad/s."""

@@ -57,9 +57,9 @@ from imudrv.errors import InputError
 from imudrv.kernels import kernel
 from imudrv.nav.attitude import Quaternion, conjugate, product, quaternion_of_vector, rows_of, turn, unit
 from imudrv.nav.earth import SEMI_MAJOR_AXIS, earth_rate_n, normal_gravity, radii
-from imudrv.nav.vectors import Vector, add, cross, dot, put, scale, subtract, vector_at
 from imudrv.records import Records
 from imudrv.units import NS
+from imudrv.vectors import Vector, add, cross, dot, put, scale, subtract, vector_at
 
 NAVIGATION: Final = np.dtype(
     [

@@ -30,9 +30,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from imudrv.kernels import kernel
 from imudrv.nav.attitude import rotate, rotation
-from imudrv.nav.vectors import Vector, add, cross, dot, row, scale
 from imudrv.sim.scenario import Rest, Rock, Rotate, Scenario, Start, Vibrate, intervals
 from imudrv.units import DEG, MM, NS, STANDARD_GRAVITY
+from imudrv.vectors import Vector, add, cross, dot, row, scale
 
 Array: TypeAlias = NDArray[np.float64]
 

@@ -21,11 +21,11 @@ import numpy as np
 from imudrv.errors import InputError
 from imudrv.kernels import kernel
 from imudrv.nav.earth import earth_rate_n, normal_gravity
-from imudrv.nav.vectors import Vector, dot, row
 from imudrv.records import PULSES, Records
 from imudrv.sim.motion import Array, Body, Dithering, Integrals, Motion, cycles_at, split_cycles
 from imudrv.sim.scenario import NOMINAL, Dither, Faults, Scenario
 from imudrv.units import ARCSEC, DEG_PER_H, DEG_PER_SQRT_H, MM, NS, PPM, UG, URAD
+from imudrv.vectors import Vector, dot, row
 
 PER_SQRT_H: Final = 1.0 / 60.0
 """One per square root of an hour, 1/sqrt(s)."""

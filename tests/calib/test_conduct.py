@@ -24,9 +24,9 @@ from imudrv import config, profiles
 from imudrv.calibration import coefficients, write_calibration
 from imudrv.diagnosis import LineState
 from imudrv.errors import InputError
-from imudrv.imu.accounting import Accountant
 from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import rate_filter
+from imudrv.imu.sequence import SequenceTracker
 from imudrv.ports.base import Arrival
 from imudrv.recording import Recording
 from imudrv.service import Service
@@ -285,8 +285,8 @@ def test_a_recording_begins_where_the_engine_asked_for_the_unit_to_be_placed(
     conducted(session, list(batches))
     placed = next(e for e in session.entries if e["event"] == "entered" and e["phase"] == "place")
     recording = Recording(session.folder / "run-z-up-1.mcap")
-    decoder, accountant = FrameDecoder(LAYOUT), Accountant(LAYOUT)
-    pulses = accountant.feed(decoder.feed(b"".join(bytes(a.data) for a in recording.arrivals())))
+    decoder, tracker = FrameDecoder(LAYOUT), SequenceTracker(LAYOUT)
+    pulses = tracker.feed(decoder.feed(b"".join(bytes(a.data) for a in recording.arrivals())))
     published = np.concatenate(list(recording.increments()))["counter"]
     # two batches of 200 samples in front of that one
     assert placed["counter"] - 600 < pulses["counter"][0] <= placed["counter"]

@@ -12,7 +12,8 @@ from calib.dither import Dither, compensated, dither_text, gain, in_increments, 
 from imudrv import profiles
 from imudrv.calibration import Calibration
 from imudrv.errors import InputError
-from imudrv.imu.compensation import Coefficients, Compensator
+from imudrv.imu.coefficients import Coefficients
+from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import NAMES, rate_filter
 from imudrv.records import PULSES, Flag
 from imudrv.sim.scenario import NOMINAL

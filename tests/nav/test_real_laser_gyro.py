@@ -19,7 +19,8 @@ from scipy.spatial.transform import Rotation
 
 from imudrv import profiles
 from imudrv.captures import Capture
-from imudrv.imu.compensation import Coefficients, Compensator
+from imudrv.imu.coefficients import Coefficients
+from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import rate_filter
 from imudrv.nav.alignment import Aligned, Alignment
 from imudrv.nav.attitude import quaternion_of_matrix

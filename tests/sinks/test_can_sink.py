@@ -6,7 +6,7 @@ import pytest
 
 from imudrv import profiles
 from imudrv.errors import InputError
-from imudrv.imu.accounting import Accountant
+from imudrv.imu.sequence import SequenceTracker
 from imudrv.records import MESSAGE, Records
 from imudrv.sinks import can as can_sink
 from imudrv.sinks.can import CanSink
@@ -35,7 +35,7 @@ def test_pulses_of_a_serial_unit_go_out_on_a_can_bus(batch, wait_for, profile: s
         sink.publish(sent)
         decoded = CanAssembler(layout).feed(receive(bus, messages))
         assert decoded.rejects.size == 0
-        pulses = Accountant(layout).feed(decoded.frames)
+        pulses = SequenceTracker(layout).feed(decoded.frames)
         for name in ("counter", "gyro", "accelerometer"):
             assert np.array_equal(pulses[name], sent.pulses[name])
         # 0.01 degC is the wire's resolution.

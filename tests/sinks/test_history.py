@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from imudrv import profiles
-from imudrv.imu.accounting import Accountant
+from imudrv.imu.sequence import SequenceTracker
 from imudrv.ports.base import Arrival
 from imudrv.records import INCREMENTS, PULSES, Records
 from imudrv.sinks.base import Batch
@@ -29,19 +29,19 @@ def wire(layout: Layout, first: int, count: int) -> bytes | Records:
 
 def filled(history: History, layout: Layout, data: bytes | Records, piece: int) -> None:
     """Fill a history as the service does, `piece` bytes or messages a read."""
-    decoder, accountant = FrameDecoder(layout), Accountant(layout)
+    decoder, tracker = FrameDecoder(layout), SequenceTracker(layout)
     for at in range(0, len(data), piece):
         read = data[at : at + piece]
         history.arrived(Arrival(at, read))
-        pulses = accountant.feed(decoder.feed(read, at))
+        pulses = tracker.feed(decoder.feed(read, at))
         if len(pulses):
             history.publish(Batch(pulses, NO_INCREMENTS, bytes(SIZE * len(pulses))))
 
 
 def decoded(layout: Layout, moments: list[Moment]) -> Records:
-    decoder, accountant = FrameDecoder(layout), Accountant(layout)
-    pulses = [accountant.feed(decoder.feed(moment.arrival.data, moment.arrival.t_ns)) for moment in moments]
-    return np.concatenate([*pulses, accountant.feed(decoder.close())])
+    decoder, tracker = FrameDecoder(layout), SequenceTracker(layout)
+    pulses = [tracker.feed(decoder.feed(moment.arrival.data, moment.arrival.t_ns)) for moment in moments]
+    return np.concatenate([*pulses, tracker.feed(decoder.close())])
 
 
 @pytest.mark.parametrize("profile", ["imu50-rs422", "imu50-rs422-acc", "imu50-can", "imu50-canfd"])

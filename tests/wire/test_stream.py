@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from imudrv.imu.accounting import Accountant
+from imudrv.imu.sequence import SequenceTracker
 from imudrv.profiles import load
 from imudrv.records import Reason
 from imudrv.sim.faults import Kind, StreamFaults
@@ -120,11 +120,11 @@ def test_a_reference_capture_decodes_to_every_frame_and_its_account_closes(refer
     found = decode(data)
     assert len(found.frames) == 74_500
     assert len(found.rejects) == 0
-    accountant = Accountant(RS422)
-    pulses = accountant.feed(found.frames)
-    account = accountant.account
-    assert (account.good, account.expected, account.frames, account.lost) == (74_500, 74_500, 74_500, 0)
-    assert account.closes
+    tracker = SequenceTracker(RS422)
+    pulses = tracker.feed(found.frames)
+    counts = tracker.counts
+    assert (counts.good, counts.expected, counts.frames, counts.lost) == (74_500, 74_500, 74_500, 0)
+    assert counts.closes
     assert np.all(np.diff(pulses["counter"]) == 1)
     assert np.all(np.diff(pulses["elapsed_ns"]) == 1_000_000)
 
@@ -152,13 +152,13 @@ def test_damage_costs_exactly_the_damaged_frames_in_any_chunks(reference, axis):
 
     whole = decode(data)
     assert np.array_equal(whole.frames["counter"], expected)
-    accountant = Accountant(RS422)
-    accountant.feed(whole.frames)
-    account = accountant.account
-    assert account.closes
-    assert account.good == len(frames) - damage.hit.sum()
-    assert account.missing + account.damaged == damage.hit.sum()
-    assert account.duplicate == np.count_nonzero(damage.kind == Kind.DOUBLED)
+    tracker = SequenceTracker(RS422)
+    tracker.feed(whole.frames)
+    counts = tracker.counts
+    assert counts.closes
+    assert counts.good == len(frames) - damage.hit.sum()
+    assert counts.missing + counts.damaged == damage.hit.sum()
+    assert counts.duplicate == np.count_nonzero(damage.kind == Kind.DOUBLED)
 
     random = np.random.default_rng(12)
     for _ in range(50 if axis == "x" else 5):

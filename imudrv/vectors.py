@@ -1,4 +1,4 @@
-"""Vector algebra on 3-tuples for numba kernels: there a tuple costs nothing, a small array an allocation."""
+"""Vector algebra for numba kernels, on tuples: there a tuple costs nothing, a small array an allocation."""
 
 from typing import TypeAlias
 
@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from imudrv.kernels import kernel
 
 Vector: TypeAlias = tuple[float, float, float]
+Matrix: TypeAlias = tuple[Vector, Vector, Vector]
+"""By rows."""
 
 
 @kernel
@@ -41,9 +43,27 @@ def cross(a: Vector, b: Vector) -> Vector:
 
 
 @kernel
-def row(matrix: NDArray[np.float64], i: int) -> Vector:
+def times(a: Vector, b: Vector) -> Vector:
+    """Multiply component by component."""
+    return a[0] * b[0], a[1] * b[1], a[2] * b[2]
+
+
+@kernel
+def rotate(C: Matrix, v: Vector) -> Vector:
+    """Return `C @ v`."""
+    return dot(C[0], v), dot(C[1], v), dot(C[2], v)
+
+
+@kernel
+def row(a: NDArray[np.float64], i: int) -> Vector:
     """Return row `i` of an array of shape (n, 3)."""
-    return matrix[i, 0], matrix[i, 1], matrix[i, 2]
+    return a[i, 0], a[i, 1], a[i, 2]
+
+
+@kernel
+def matrix(a: NDArray[np.float64]) -> Matrix:
+    """Return the rows of an array of shape (3, 3)."""
+    return row(a, 0), row(a, 1), row(a, 2)
 
 
 @kernel
