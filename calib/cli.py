@@ -85,6 +85,9 @@ def _commands() -> CommandLine:
             help="for given: where accelerometer A senses, mm, from a drawing; such as y=12.5,-3,40",
         )
 
+    def add_channel(sub: argparse.ArgumentParser) -> None:
+        sub.add_argument("--channel", metavar="NAME", help="CAN channel of candump logs, such as can0")
+
     sub = add("identify", _identify, "Captures of rotations to lever arms, certificate and report.")
     sub.add_argument(
         "captures",
@@ -96,6 +99,7 @@ def _commands() -> CommandLine:
     sub.add_argument(
         "--profile", metavar="P", help=f"{', '.join(profiles.shipped())}, or a file; recordings know theirs"
     )
+    add_channel(sub)
     sub.add_argument(
         "--calibration", type=Path, metavar="C.yaml", help="the unit's; default: the recordings' own"
     )
@@ -149,6 +153,7 @@ def _commands() -> CommandLine:
     )
     sub.add_argument("--seeds", type=int, default=1, metavar="N", help="simulated units (default: 1)")
     sub.add_argument("--profile", metavar="P", help="as for identify")
+    add_channel(sub)
     sub.add_argument("--calibration", type=Path, metavar="C.yaml", help="the unit's, with lever arms")
     sub.add_argument("--site", type=Path, metavar="S.yaml", help="where the unit stood")
     sub.add_argument(
@@ -251,6 +256,7 @@ def _identify(arguments: argparse.Namespace) -> None:
             pivot=arguments.pivot,
             nine=arguments.gauge == "given" and stated is None,
             extra=arguments.estimate,
+            channel=arguments.channel,
             advance=advance,
         )
     arms = _wanted(findings.arms, arguments.gauge, stated)
@@ -321,7 +327,7 @@ def _navigated(arguments: argparse.Namespace) -> tuple[Calibration, list[tuple[T
     profile = profiles.load(arguments.profile) if arguments.profile else None
     found = []
     for path in arguments.recordings:
-        capture = Capture(path, profile)
+        capture = Capture(path, profile, arguments.channel)
         setting = Setting(
             capture.layout,
             calibration,

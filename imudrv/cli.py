@@ -56,14 +56,17 @@ def _commands() -> CommandLine:
         text = f"{', '.join(profiles.shipped())}, or a profile file"
         sub.add_argument("--profile", required=required, metavar="P", help=text)
 
+    def add_capture(sub: argparse.ArgumentParser) -> None:
+        sub.add_argument("capture", type=Path, help="wire bytes, a candump log, or a recording.mcap")
+        add_profile(sub)
+        sub.add_argument("--channel", metavar="NAME", help="CAN channel of a candump log, such as can0")
+
     sub = add("decode", _decode, "Capture to pulse increments.")
-    sub.add_argument("capture", type=Path, help="wire bytes, a candump log, or a recording.mcap")
-    add_profile(sub)
+    add_capture(sub)
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="NAME.csv or NAME.npz")
 
     sub = add("compensate", _compensate, "Capture to compensated increments in body axes.")
-    sub.add_argument("capture", type=Path, help="wire bytes, a candump log, or a recording.mcap")
-    add_profile(sub)
+    add_capture(sub)
     sub.add_argument(
         "--calibration", type=Path, metavar="C.yaml", help="the unit's; default: the recording's own"
     )
@@ -185,7 +188,8 @@ def _compensate(arguments: argparse.Namespace) -> None:
 
 
 def _capture(arguments: argparse.Namespace) -> Capture:
-    return Capture(arguments.capture, profiles.load(arguments.profile) if arguments.profile else None)
+    profile = profiles.load(arguments.profile) if arguments.profile else None
+    return Capture(arguments.capture, profile, arguments.channel)
 
 
 def _sim(arguments: argparse.Namespace) -> None:
@@ -284,3 +288,5 @@ def _report(capture: Capture, output: Path) -> None:
         first = ", ".join(map(str, rejected.first))
         more = ", ..." if rejected.stretches > len(rejected.first) else ""
         print(f"  {name}: {rejected.stretches} x, {rejected.length} in all, at {first}{more}")
+    for channel, messages in list(capture.channels.items())[1:]:
+        print(f"  left out: {messages} messages of channel {channel}")
