@@ -286,6 +286,7 @@ def _capture(source: Source) -> dict[str, Any]:
         "name": source.name,
         "sha256": source.sha256,
         "profile": source.profile,
+        **({} if source.channel is None else {"channel": source.channel}),
         "duration_s": evidence.segments.duration_s,
         "samples": source.books,
         "temperature_degc": {t.channel: [t.least_degc, t.most_degc] for t in source.temperatures},

@@ -44,6 +44,7 @@ from imudrv.console import BAD_INPUT, OK, CommandLine, progress
 from imudrv.errors import InputError
 from imudrv.imu.rate_filter import NAMES, rate_filter
 from imudrv.nav.alignment import DURATION_S
+from imudrv.outputs import file_to_write, require_other
 from imudrv.recording import Recording
 from imudrv.sinks.files import replacing
 from imudrv.site import Site
@@ -85,6 +86,9 @@ def _commands() -> CommandLine:
             help="for given: where accelerometer A senses, mm, from a drawing; such as y=12.5,-3,40",
         )
 
+    def add_channel(sub: argparse.ArgumentParser) -> None:
+        sub.add_argument("--channel", metavar="NAME", help="CAN channel of candump logs, such as can0")
+
     sub = add("identify", _identify, "Captures of rotations to lever arms, certificate and report.")
     sub.add_argument(
         "captures",
@@ -96,6 +100,7 @@ def _commands() -> CommandLine:
     sub.add_argument(
         "--profile", metavar="P", help=f"{', '.join(profiles.shipped())}, or a file; recordings know theirs"
     )
+    add_channel(sub)
     sub.add_argument(
         "--calibration", type=Path, metavar="C.yaml", help="the unit's; default: the recordings' own"
     )
@@ -156,6 +161,7 @@ def _commands() -> CommandLine:
     )
     sub.add_argument("--seeds", type=int, default=1, metavar="N", help="simulated units (default: 1)")
     sub.add_argument("--profile", metavar="P", help="as for identify")
+    add_channel(sub)
     sub.add_argument("--calibration", type=Path, metavar="C.yaml", help="the unit's, with lever arms")
     sub.add_argument("--site", type=Path, metavar="S.yaml", help="where the unit stood")
     sub.add_argument(
@@ -244,6 +250,9 @@ def _verify(arguments: argparse.Namespace) -> int:
 
 def _identify(arguments: argparse.Namespace) -> None:
     stated = _stated(arguments.at)
+    inputs = (*arguments.captures, arguments.profile, arguments.calibration, arguments.site)
+    for output in filter(None, (arguments.output, arguments.json, arguments.report)):
+        _check_output(output, *inputs)
     basis = _basis(arguments)
     check_target(arguments.output, basis.calibration)
     site = config.read(arguments.site, Site)
@@ -259,6 +268,7 @@ def _identify(arguments: argparse.Namespace) -> None:
             pivot=arguments.pivot,
             nine=arguments.gauge == "given" and stated is None,
             extra=arguments.estimate,
+            channel=arguments.channel,
             advance=advance,
         )
     arms = _wanted(findings.arms, arguments.gauge, stated)
@@ -287,6 +297,9 @@ def _validate(arguments: argparse.Namespace) -> int:
     """Judge recordings, or simulated units."""
     if (arguments.simulate is None) == (not arguments.recordings):
         raise InputError("validate: expected either recordings or --simulate")
+    if arguments.report is not None:
+        inputs = (*arguments.recordings, arguments.profile, arguments.calibration, arguments.site)
+        _check_output(arguments.report, *inputs)
     if arguments.simulate is not None:
         trials = [(trial, judge(trial)) for trial in _simulated(arguments)]
         shown = sum(trial.name.endswith("unit 1") for trial, _ in trials)
@@ -329,7 +342,7 @@ def _navigated(arguments: argparse.Namespace) -> tuple[Calibration, list[tuple[T
     profile = profiles.load(arguments.profile) if arguments.profile else None
     found = []
     for path in arguments.recordings:
-        capture = Capture(path, profile)
+        capture = Capture(path, profile, arguments.channel)
         setting = Setting(
             capture.layout,
             calibration,
@@ -342,6 +355,12 @@ def _navigated(arguments: argparse.Namespace) -> tuple[Calibration, list[tuple[T
             trial = navigate(path.name, capture.pulses(advance), setting)
         found.append((trial, judge(trial)))
     return calibration, found
+
+
+def _check_output(path: Path, *inputs: str | Path | None) -> None:
+    """Refuse an output before the work, instead of behind it."""
+    file_to_write(path)
+    require_other(path, *inputs)
 
 
 def _written(path: Path, calibration: Calibration, arms: Arms) -> str:
@@ -384,6 +403,7 @@ def _basis(arguments: argparse.Namespace) -> Basis:
 
 
 def _gauge(arguments: argparse.Namespace) -> None:
+    _check_output(arguments.output, arguments.file)
     calibration = read_calibration(arguments.file)
     before = arms_of(calibration, str(arguments.file))
     stated = _stated(arguments.at)
@@ -412,6 +432,7 @@ def _export_arms(arguments: argparse.Namespace) -> None:
 
 
 def _import_arms(arguments: argparse.Namespace) -> None:
+    _check_output(arguments.output, arguments.file, arguments.calibration)
     calibration = read_calibration(arguments.calibration)
     if arguments.program == "kalibr":
         arms = from_kalibr(config.read(arguments.file, _Kalibr).imu0)

@@ -76,6 +76,8 @@ class Source:
         Of the channels that were heard.
     evidence : Evidence
         Rests, rotations, runs.
+    channel : str or None
+        The CAN channel that was chosen of a candump log.
     """
 
     label: str
@@ -85,6 +87,7 @@ class Source:
     books: str
     temperatures: tuple[Temperature, ...]
     evidence: Evidence
+    channel: str | None = None
 
 
 @dataclass(frozen=True)
@@ -158,6 +161,7 @@ def find(
     pivot: Literal["free", "fixed"] = "free",
     nine: bool = False,
     extra: Sequence[Extra] = (),
+    channel: str | None = None,
     advance: Callable[[int], None] = lambda _: None,
 ) -> Findings:
     """Identify the inner lever arms from captures of one unit.
@@ -174,6 +178,8 @@ def find(
         Where the unit stands.
     method, pivot, nine, extra
         See `calib.identify.joint`; `plain` knows no others.
+    channel : str or None
+        The CAN channel to read, of candump logs; needed where a log has several.
     advance : callable
         Told the number of bytes read, of twice their sum.
 
@@ -196,7 +202,7 @@ def find(
     sources: list[Source] = []
     for path in captures:
         label = _label(path, [source.label for source in sources])
-        source = _read(path, label, profile, basis.calibration, site, limits, priors, advance)
+        source = _read(path, label, profile, channel, basis.calibration, site, limits, priors, advance)
         for other in sources:
             if other.sha256 == source.sha256:
                 raise InputError(f"{path}: expected another capture, got that of {other.name} once more")
@@ -238,6 +244,7 @@ def _read(
     path: Path,
     label: str,
     profile: Profile | None,
+    channel: str | None,
     calibration: Calibration,
     site: Site,
     limits: Limits,
@@ -246,12 +253,12 @@ def _read(
 ) -> Source:
     """Take a capture through both passes, with its books and temperatures."""
     known = replace(coefficients(calibration), r_b=None)
-    capture = Capture(path, profile)
+    capture = Capture(path, profile, channel)
     low, high = np.full(6, np.inf), np.full(6, -np.inf)
 
     def increments() -> Iterator[Records]:
         nonlocal capture
-        capture = Capture(path, profile)
+        capture = Capture(path, profile, channel)
         layout = capture.layout
         compensator = Compensator(known, layout, rate_filter("causal", layout.interval_ns))
         for pulses in capture.pulses(advance):
@@ -278,6 +285,7 @@ def _read(
             if least <= most
         ),
         evidence,
+        channel,
     )
 
 

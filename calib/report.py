@@ -257,9 +257,10 @@ def _measured(findings: Findings) -> Iterator[Block]:
             f"{channel.replace('_', ' ')} {least:.1f} to {most:.1f}"
             for channel, least, most in source.temperatures
         )
+        parts = [source.name, source.profile] + ([f"channel {source.channel}"] if source.channel else [])
         yield Pairs(
             (
-                ("capture", f"{printable(source.name)}, {printable(source.profile)}"),
+                ("capture", printable(", ".join(parts))),
                 ("SHA-256", source.sha256),
                 ("contents", f"{source.evidence.segments.duration_s:.1f} s; {source.books}"),
                 ("temperature", f"{warm} degC" if warm else "not told by the unit"),

@@ -14,6 +14,7 @@ from imudrv.imu.sequence import SequenceTracker
 from imudrv.profiles import Profile
 from imudrv.recording import Recording
 from imudrv.records import Flag, Reason, Records
+from imudrv.wire.candump import CandumpDecoder
 from imudrv.wire.decoder import CaptureDecoder, FrameDecoder, Rejected
 
 CHUNK_BYTES = 1 << 19
@@ -31,14 +32,17 @@ class Capture:
         Wire bytes; for a CAN profile a candump log; where the name ends in ``.mcap`` a recording.
     profile : Profile, optional
         What the unit sends. A recording knows it.
+    channel : str, optional
+        The channel of a candump log to read; needed where the log has several.
 
     Raises
     ------
     InputError
-        There is no such file, it is empty, or it is no recording and there is no profile.
+        There is no such file, it is empty, it is no recording and there is no profile, or there is a channel
+        and it is no candump log.
     """
 
-    def __init__(self, path: Path, profile: Profile | None = None) -> None:
+    def __init__(self, path: Path, profile: Profile | None = None, channel: str | None = None) -> None:
         self.path = path
         try:
             with path.open("rb") as file:
@@ -55,13 +59,30 @@ class Capture:
             raise InputError(f"{path}: expected --profile, for only a recording knows what the unit sends")
         self.profile = profile
         self.layout = profile.layout()
+        if channel is not None and (self.recording is not None or not self.layout.can):
+            kind = "a recording" if self.recording is not None else f"a capture of {self.layout.name}"
+            raise InputError(
+                f"{path}: --channel {channel}: expected a candump log, got {kind}; leave --channel out"
+            )
         self.tracker = SequenceTracker(self.layout)
-        self._decoder = CaptureDecoder(self.layout) if self.recording is None else FrameDecoder(self.layout)
+        self._channel = channel
+        self._decoder: CaptureDecoder | FrameDecoder = (
+            FrameDecoder(self.layout) if self.recording is not None else CaptureDecoder(self.layout, channel)
+        )
 
     @property
     def rejected(self) -> dict[Reason, Rejected]:
         """What was no frame, by reason."""
         return self._decoder.rejected
+
+    @property
+    def channels(self) -> dict[str, int]:
+        """Number of messages of each channel of a candump log, first of the one that is read."""
+        return self._log.channels if self._log is not None else {}
+
+    @property
+    def _log(self) -> CandumpDecoder | None:
+        return self._decoder.log if isinstance(self._decoder, CaptureDecoder) else None
 
     def pulses(self, advance: Callable[[int], None]) -> Iterator[Records]:
         """Decode the file, piece by piece.
@@ -79,11 +100,14 @@ class Capture:
         Raises
         ------
         InputError
-            The whole file held no frame of the profile; says which shipped profile fits, if one does.
+            The whole file held no frame of the profile; says which shipped profile fits, if one does. A log
+            has several channels and none was chosen, or not the chosen one; names them.
         """
         for frames in self._frames(advance):
             yield self.tracker.feed(frames)
-        yield self.tracker.feed(self._decoder.close())
+        frames = self._decoder.close()
+        self._check_channel()
+        yield self.tracker.feed(frames)
         if self.tracker.counts.frames == 0:
             raise InputError(
                 f"{self.path}: expected frames of {self.layout.name}, "
@@ -121,7 +145,9 @@ class Capture:
         if isinstance(self._decoder, CaptureDecoder):
             with self.path.open("rb") as file:
                 while data := file.read(CHUNK_BYTES):
-                    yield self._decoder.feed(data)
+                    frames = self._decoder.feed(data)
+                    self._check_channel()
+                    yield frames
                     advance(len(data))
             return
         assert self.recording is not None
@@ -131,11 +157,16 @@ class Capture:
             yield np.concatenate([self._decoder.feed(arrival.data, arrival.t_ns) for arrival in some])
             advance(sum(len(arrival.data) for arrival in some))
 
+    def _check_channel(self) -> None:
+        if self._log is not None:
+            self._log.check_channel(str(self.path), "--channel ")
+
     def _hint(self) -> str:
         if self.recording is None:
             for name in profiles.shipped():
                 layout = profiles.load(name).layout()
-                if layout.name != self.layout.name and len(CaptureDecoder(layout).feed(self._head)):
+                decoder = CaptureDecoder(layout, self._channel)
+                if layout.name != self.layout.name and len(decoder.feed(self._head)):
                     return f"; its beginning has frames of {name}: try --profile {name}"
         return "; is it the right file, and the right --profile?"
 

@@ -284,12 +284,16 @@ def make_candump(rng: Generator) -> tuple[Setup, bytes]:
 
 def check_candump(_: Setup, data: bytes, cuts: Cuts) -> None:
     """Each line is a message, a reject or blank; what was read can be written and read again."""
+    channels: list[dict[str, int]] = []
 
     def decode(parts: list[bytes]) -> list[Records]:
         decoder, kept = CandumpDecoder(), LONGEST_LINE + 1
-        return fed(decoder, parts, lambda n, *_: decoder.bytes_fed == n and decoder._line.size <= kept)
+        found = fed(decoder, parts, lambda n, *_: decoder.bytes_fed == n and decoder._line.size <= kept)
+        channels.append(decoder.channels)
+        return found
 
     messages, rejects = both(decode, data, cuts)
+    assert channels[0] == channels[1], f"whole: {channels[0]}, in pieces: {channels[1]}"
     bad = {offset: size for offset, size, _ in rejects.tolist()}
     offset = lines = 0
     for line in io.BytesIO(data):
@@ -297,7 +301,8 @@ def check_candump(_: Setup, data: bytes, cuts: Cuts) -> None:
         lines += bool(line.strip(b" \t\r\n")) or len(line.rstrip(b"\n")) > LONGEST_LINE
         offset += len(line)
     assert not bad, f"rejects that begin no line: {bad}"
-    assert lines == len(messages) + len(rejects), f"{lines} lines, {len(messages)} messages"
+    assert lines == sum(channels[0].values()) + len(rejects), f"{lines} lines, messages {channels[0]}"
+    assert len(messages) == next(iter(channels[0].values()), 0), f"{len(messages)} messages of {channels[0]}"
     assert np.all(messages["length"] <= np.where(messages["fd"], 64, 8)), "more data than a bus carries"
     assert np.all(messages["id"] < 2**29), "no bus has such an identifier"
     again, _ = decode([format_candump(messages)])

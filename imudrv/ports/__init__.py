@@ -18,6 +18,7 @@
 ``...?bitrate=500000&data_bitrate=2000000&fd=true``    other settings; the rest goes to python-can
 ``replay://FILE``                                      raw capture, candump log, ``.mcap`` recording
 ``replay://FILE?speed=10``, ``?speed=max``             at ten times the pace; as fast as it can be read
+``replay://FILE?channel=can0``                         one channel of a candump log that has several
 ``sim://SCENARIO.yaml``, ``sim://rocking?speed=max``   simulated unit; a file, or a shipped scenario's name
 =====================================================  ====================================================
 

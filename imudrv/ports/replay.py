@@ -43,7 +43,7 @@ def prepare(url: Url, profile: Profile) -> Callable[[], Port]:
     Parameters
     ----------
     url : Url
-        ``replay://FILE``.
+        ``replay://FILE``; with ``channel`` that of a candump log to read, needed where the log has several.
     profile : Profile
         What the file holds; a CAN profile reads candump logs, another one raw captures.
 
@@ -57,10 +57,17 @@ def prepare(url: Url, profile: Profile) -> Callable[[], Port]:
     InputError
         It makes no sense, or the file is not there or empty.
     """
-    if unknown := [name for name in url.options if name != "speed"]:
-        raise InputError(f"{url.text}: expected no option but speed, got {', '.join(unknown)}")
+    path, layout = Path(url.address), profile.layout()
+    is_log = layout.can and path.suffix != ".mcap"
+    if "channel" in url.options and not is_log:
+        kind = "a recording" if path.suffix == ".mcap" else f"a capture of {layout.name}"
+        raise InputError(f"{url.text}: channel: expected a candump log, got {kind}; leave the option out")
+    options = ("speed", "channel") if is_log else ("speed",)
+    if unknown := [name for name in url.options if name not in options]:
+        raise InputError(
+            f"{url.text}: expected no option but {' and '.join(options)}, got {', '.join(unknown)}"
+        )
     speed = _speed(url)
-    path = Path(url.address)
     try:
         with path.open("rb") as file:
             empty = not file.read(1)
@@ -70,7 +77,7 @@ def prepare(url: Url, profile: Profile) -> Callable[[], Port]:
         ) from error
     if empty:
         raise InputError(f"{url.text}: expected a file to replay, got an empty one")
-    return partial(_open, url.text, path, profile.layout(), speed)
+    return partial(_open, url.text, path, layout, speed, url.options.get("channel"))
 
 
 class ReplayPort(Port):
@@ -150,13 +157,13 @@ def _speed(url: Url) -> float | None:
     return speed
 
 
-def _open(url: str, path: Path, layout: Layout, speed: float | None) -> Port:
+def _open(url: str, path: Path, layout: Layout, speed: float | None, channel: str | None) -> Port:
     step_ns = None if speed is None else max(1, int(speed * _STEP_NS))
     nothing: bytes | Records = np.zeros(0, MESSAGE) if layout.can else b""
     if path.suffix == ".mcap":
         pieces = _recording(path, layout)
     elif layout.can:
-        pieces = _log(path, layout, step_ns)
+        pieces = _log(path, layout, step_ns, channel)
     else:
         pieces = _capture(path, layout, step_ns)
     return ReplayPort(url, pieces, speed, nothing)
@@ -172,14 +179,15 @@ def _capture(path: Path, layout: Layout, step_ns: int | None) -> Pieces:
             yield Arrival(math.ceil(end / length) * layout.interval_ns, data)
 
 
-def _log(path: Path, layout: Layout, step_ns: int | None) -> Pieces:
-    decoder = CandumpDecoder()
+def _log(path: Path, layout: Layout, step_ns: int | None, channel: str | None) -> Pieces:
+    decoder = CandumpDecoder(channel)
     found = 0
     with path.open("rb") as file:
         text = b"\n"
         while text:
             text = file.read(_CHUNK_BYTES)
             messages, _ = decoder.feed(text) if text else decoder.close()
+            decoder.check_channel(str(path), "?channel=")
             found += messages.size
             cuts = () if step_ns is None else np.flatnonzero(np.diff(messages["t_ns"] // step_ns)) + 1
             for piece in np.split(messages, cuts):

@@ -18,11 +18,14 @@ from imudrv.units import NS_PER_S
 
 LONGEST_LINE: Final = 256
 """Characters of a line, its end not counted; a longer one is no message."""
+MOST_CHANNELS: Final = 16
+"""Channels that are told apart by name, as many as candump itself listens to."""
 
 _NEWLINE, _TAB, _RETURN, _SPACE = ord("\n"), ord("\t"), ord("\r"), ord(" ")
 _OPEN, _CLOSE, _POINT, _HASH, _ZERO = ord("("), ord(")"), ord("."), ord("#"), ord("0")
 _RECEIVED, _TRANSMITTED = ord("R"), ord("T")
 _NOT_HEX: Final = 255
+_NO_MESSAGE: Final = -1
 _LAST_SECOND: Final = (2**63 - 1) // NS_PER_S - 1
 _NOT_A_MESSAGE: Final = int(Reason.NOT_A_MESSAGE)
 
@@ -37,14 +40,31 @@ class CandumpDecoder:
 
     The messages and rejects are the same for any cut of the text into pieces, and every byte fed is in the
     line of a message, in a blank line, in a reject (its line, whole) or among the `pending` ones. Remote
-    frames carry no data and are rejects. The channel is not looked at: a log of several is for its reader to
-    sort.
+    frames carry no data and are rejects.
+
+    Only the messages of one channel come out, so that two units in one log are never mixed; `check_channel`
+    refuses a log of several channels where none was chosen.
+
+    Parameters
+    ----------
+    channel : str, optional
+        The channel to read; that of the first message if absent.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, channel: str | None = None) -> None:
         self._line: NDArray[np.uint8] = np.zeros(0, np.uint8)
         self._cut = 0
         self._offset = 0
+        self._is_closed = False
+        self._channel = channel
+        # Row 0 is the channel that is read; a name ends with a zero, a free row has none. The last count is
+        # that of the channels for which no row was free.
+        self._names = np.zeros((MOST_CHANNELS, LONGEST_LINE + 1), np.uint8)
+        self._counts = np.zeros(MOST_CHANNELS + 1, np.int64)
+        if channel is not None:
+            # A blank is in no channel of a log, and a line has no room for a longer name.
+            name = channel.encode(errors="surrogatepass").replace(b"\0", b" ")[:LONGEST_LINE] or b" "
+            self._names[0, : len(name)] = list(name)
 
     @property
     def pending(self) -> int:
@@ -55,6 +75,40 @@ class CandumpDecoder:
     def bytes_fed(self) -> int:
         """Bytes fed since the beginning."""
         return self._offset + self.pending
+
+    @property
+    def channels(self) -> dict[str, int]:
+        """Messages of each channel so far; those of the channels beyond `MOST_CHANNELS` are ``others``."""
+        names = [bytes(row).rstrip(b"\0").decode("ascii", "backslashreplace") for row in self._names]
+        counts = self._counts.tolist()
+        return {name: count for name, count in zip([*names, "others"], counts, strict=True) if count}
+
+    def check_channel(self, log: str, option: str) -> None:
+        """Refuse a log of several channels where none was chosen, and at its end one without the chosen one.
+
+        Parameters
+        ----------
+        log : str
+            Name of the log, for the message.
+        option : str
+            How to choose a channel, up to its name, for the message.
+
+        Raises
+        ------
+        InputError
+            The message names the channels of the log so far.
+        """
+        names = sorted(self.channels)
+        came = " and ".join(", ".join(names).rsplit(", ", 1))
+        if self._channel is None and len(names) > 1:
+            raise InputError(
+                f"{log}: expected messages of one CAN channel, got those of {came}; "
+                f"choose one, as with {option}{names[0]}"
+            )
+        if self._channel is not None and self._is_closed and names and not self._counts[0]:
+            raise InputError(
+                f"{log}: expected messages of CAN channel {self._channel!r}, got those of {came}"
+            )
 
     def feed(self, data: bytes | bytearray | memoryview | NDArray[np.uint8]) -> tuple[Records, Records]:
         """Take text in.
@@ -67,7 +121,7 @@ class CandumpDecoder:
         Returns
         -------
         messages : ndarray of MESSAGE
-            With the log's own times.
+            Of the channel that is read, with the log's own times.
         rejects : ndarray of REJECT
             Lines that are no message.
         """
@@ -75,7 +129,7 @@ class CandumpDecoder:
         ends = np.flatnonzero(text == _NEWLINE)
         messages = np.zeros(ends.size, MESSAGE)
         rejects = np.zeros(ends.size, REJECT)
-        found, rejected = _scan(text, ends, messages, rejects)
+        found, rejected = _scan(text, ends, messages, rejects, self._names, self._counts)
         rejects = rejects[:rejected]
         rejects["offset"] += self._offset
         if ends.size and self._cut:
@@ -100,6 +154,7 @@ class CandumpDecoder:
             As from `feed`; at the most one of both together.
         """
         messages, rejects = self.feed(b"\n")
+        self._is_closed = True
         self._offset -= 1
         rejects["length"] -= 1
         rejects["reason"] = Reason.UNFINISHED
@@ -107,48 +162,62 @@ class CandumpDecoder:
 
 
 @kernel
-def _scan(text, ends, messages, rejects):  # type: ignore[no-untyped-def]
+def _scan(text, ends, messages, rejects, names, counts):  # type: ignore[no-untyped-def]
     """Read every whole line; `ends` has where their newlines stand."""
     start = found = rejected = 0
     for i in range(ends.shape[0]):
         end = ends[np.uint64(i)]
         message = messages[found]
-        if end - start <= LONGEST_LINE and _parse(text, start, message):
+        other = _parse(text, start, message, names) if end - start <= LONGEST_LINE else _NO_MESSAGE
+        row = _row_of(text, other, names) if other > 0 else other
+        if row == 0:
             found += 1
         else:
             message.data[:] = 0
-            if text[_skip_blanks(text, start)] != _NEWLINE or end - start > LONGEST_LINE:
+            if row > 0:
+                counts[np.uint64(row)] += 1
+            elif text[_skip_blanks(text, start)] != _NEWLINE or end - start > LONGEST_LINE:
                 rejects[rejected].offset = start
                 rejects[rejected].length = end + 1 - start
                 rejects[rejected].reason = _NOT_A_MESSAGE
                 rejected += 1
         start = end + 1
+    counts[0] += found
     return found, rejected
 
 
 @kernel
-def _parse(text, p, message):  # type: ignore[no-untyped-def]
-    """Read the line at `p` into `message`, whose data are zeros; no step goes past the line's newline."""
+def _parse(text, p, message, names):  # type: ignore[no-untyped-def]
+    """Read the line at `p` into `message`, whose data are zeros; no step goes past the line's newline.
+
+    Returns 0 for a message of the channel that is read, the place of the channel's name for one of another
+    channel, and `_NO_MESSAGE` otherwise.
+    """
     if text[p] != _OPEN:
-        return False
+        return _NO_MESSAGE
     p, seconds, digits = _decimal(text, p + 1)
     if digits < 1 or digits > 10 or seconds > _LAST_SECOND or text[p] != _POINT:
-        return False
+        return _NO_MESSAGE
     p, fraction, digits = _decimal(text, p + 1)
     if digits < 1 or digits > 9 or text[p] != _CLOSE:
-        return False
+        return _NO_MESSAGE
     for _ in range(9 - digits):
         fraction *= 10
     message.t_ns = seconds * NS_PER_S + fraction
     channel = _skip_blanks(text, p + 1)
     if channel == p + 1:
-        return False
+        return _NO_MESSAGE
     p = channel
-    while text[p] > _SPACE:
+    while text[np.uint64(p)] > _SPACE and text[np.uint64(p)] == names[0, np.uint64(p - channel)]:
         p += 1
+    other = 0
+    if text[np.uint64(p)] > _SPACE or names[0, np.uint64(p - channel)] != 0:
+        other = channel
+        while text[p] > _SPACE:
+            p += 1
     begin = _skip_blanks(text, p)
     if p == channel or begin == p:
-        return False
+        return _NO_MESSAGE
 
     p = begin
     identifier = np.int64(0)
@@ -157,26 +226,26 @@ def _parse(text, p, message):  # type: ignore[no-untyped-def]
         p += 1
     limit = 0x7FF if p - begin == 3 else 0x1FFFFFFF
     if (p - begin != 3 and p - begin != 8) or identifier > limit or text[p] != _HASH:
-        return False
+        return _NO_MESSAGE
     message.id = identifier
     p += 1
     longest = 8
     message.fd = 0
     if text[p] == _HASH:
         if _NIBBLES[text[p + 1]] == _NOT_HEX:
-            return False
+            return _NO_MESSAGE
         message.fd = 1
         longest = 64
         p += 2
 
     length = 0
     while length < longest:
-        high = _NIBBLES[text[p]]
+        high = _NIBBLES[text[np.uint64(p)]]
         if high == _NOT_HEX:
             break
-        low = _NIBBLES[text[p + 1]]
+        low = _NIBBLES[text[np.uint64(p + 1)]]
         if low == _NOT_HEX:
-            return False
+            return _NO_MESSAGE
         message.data[np.uint64(length)] = high << 4 | low
         length += 1
         p += 2
@@ -184,7 +253,26 @@ def _parse(text, p, message):  # type: ignore[no-untyped-def]
     end = _skip_blanks(text, p)
     if end > p and (text[end] == _RECEIVED or text[end] == _TRANSMITTED):
         end = _skip_blanks(text, end + 1)
-    return text[end] == _NEWLINE
+    return other if text[end] == _NEWLINE else _NO_MESSAGE
+
+
+@kernel
+def _row_of(text, begin, names):  # type: ignore[no-untyped-def]
+    """Row of the channel whose name is at `begin`; a new channel gets the first free row."""
+    length = 0
+    while text[begin + length] > _SPACE:
+        length += 1
+    for row in range(MOST_CHANNELS):
+        if names[row, 0] == 0:
+            for k in range(length):
+                names[row, k] = text[begin + k]
+            return row
+        same = 0
+        while same < length and text[begin + same] == names[row, same]:
+            same += 1
+        if same == length and names[row, same] == 0:
+            return row
+    return MOST_CHANNELS
 
 
 @kernel

@@ -98,11 +98,13 @@ class CaptureDecoder:
     ----------
     layout : Layout
         Of the profile.
+    channel : str, optional
+        The channel of a candump log to read; that of the first message if absent.
     """
 
-    def __init__(self, layout: Layout) -> None:
+    def __init__(self, layout: Layout, channel: str | None = None) -> None:
         self._frames = FrameDecoder(layout)
-        self._log = CandumpDecoder() if layout.can else None
+        self.log = CandumpDecoder(channel) if layout.can else None
 
     @property
     def rejected(self) -> dict[Reason, Rejected]:
@@ -122,9 +124,9 @@ class CaptureDecoder:
         ndarray of FRAME
             The frames that became complete.
         """
-        if self._log is None:
+        if self.log is None:
             return self._frames.feed(data)
-        messages, rejects = self._log.feed(data)
+        messages, rejects = self.log.feed(data)
         self._frames.tally(rejects)
         return self._frames.feed(messages)
 
@@ -136,8 +138,8 @@ class CaptureDecoder:
         ndarray of FRAME
             The frames that were held back.
         """
-        if self._log is None:
+        if self.log is None:
             return self._frames.close()
-        messages, rejects = self._log.close()
+        messages, rejects = self.log.close()
         self._frames.tally(rejects)
         return np.concatenate([self._frames.feed(messages), self._frames.close()])

@@ -142,6 +142,26 @@ def test_recordings_bring_their_own_profile_and_calibration(
     assert "x.raw: expected --calibration, for there is none in it" in capsys.readouterr().err
 
 
+def test_a_chosen_channel_of_a_log_of_two_units_is_named_in_certificate_and_report(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for pose in "xyz":
+        units = []
+        for channel, unit in enumerate((pose, "still")):
+            arguments = ["sim", f"{unit}.yaml", "--profile", "imu50-can", "-o", "unit.log"]
+            assert imudrv(arguments) == 0
+            text = (here / "unit.log").read_text().replace("can0", f"can{channel}")
+            units += text.splitlines(keepends=True)
+        (here / f"{pose}.log").write_text("".join(sorted(units, key=lambda line: line[:20])))
+    logs = ["identify", "x.log", "y.log", "z.log", "--profile", "imu50-can", "--calibration", "unit.yaml"]
+    logs += ["--site", "site.yaml", "--channel", "can0", "-o", "chosen.yaml"]
+    assert main(logs) == 0
+    assert "z.log, imu50-can, channel can0" in capsys.readouterr().out
+    provenance = yaml.safe_load((here / "chosen.yaml").read_text())["provenance"]
+    captures = provenance["inner_lever_arms"]["captures"]
+    assert [capture["channel"] for capture in captures] == ["can0"] * 3
+
+
 def test_a_certificate_that_the_data_contradict_is_refused_but_the_report_is_there(
     here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

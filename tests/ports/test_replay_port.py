@@ -91,6 +91,22 @@ def test_a_line_that_is_no_message_costs_no_other(can_profile, tmp_path, opened,
     assert np.array_equal(np.concatenate([arrival.data for arrival in found]), _messages(6))
 
 
+def test_a_log_of_two_channels_is_refused_where_the_second_one_comes(
+    can_profile, tmp_path, opened, to_the_end
+):
+    messages, log = _messages(4000), tmp_path / "two.log"
+    log.write_bytes(format_candump(messages[:3999]) + format_candump(messages[3999:], "can1"))
+    refused = r"two\.log: expected messages of one CAN channel, got those of can0 and can1; .* \?channel=can0"
+    for speed in ("max", "50"):
+        with pytest.raises(InputError, match=refused):
+            to_the_end(opened(f"replay://{log}?speed={speed}", can_profile))
+    for channel, expected in (("can0", messages[:3999]), ("can1", messages[3999:])):
+        found = to_the_end(opened(f"replay://{log}?speed=max&channel={channel}", can_profile))
+        assert np.array_equal(np.concatenate([arrival.data for arrival in found]), expected)
+    with pytest.raises(InputError, match="of CAN channel 'can', got those of can0 and can1"):
+        opened(f"replay://{log}?channel=can", can_profile)
+
+
 def _recording(path, encoding, reads):
     with path.open("wb") as file:
         writer = Writer(file)
@@ -185,6 +201,14 @@ def test_a_file_that_cannot_be_replayed_is_the_users_mistake(capture, rs422, can
         open_port(f"replay://{empty}", rs422)
     with pytest.raises(InputError, match="expected a file to replay, cannot read it: Is a directory"):
         open_port(f"replay://{tmp_path}", rs422)
+    for name, profile, kind in (
+        ("unit.raw", rs422, "a capture of imu50-rs422"),
+        ("unit.mcap", can_profile, "a recording"),
+    ):
+        with pytest.raises(InputError, match=f"channel: expected a candump log, got {kind}; leave"):
+            open_port(f"replay://{tmp_path / name}?channel=can0", profile)
+    with pytest.raises(InputError, match="expected no option but speed and channel, got sped"):
+        open_port(f"replay://{capture}?sped=max", can_profile)
     with pytest.raises(InputError, match="expected no option but speed, got sped"):
         open_port(f"replay://{capture}?sped=max", rs422)
     size = capture.stat().st_size

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 
 from imudrv.errors import InputError
 from imudrv.records import MESSAGE, REJECT, Reason
-from imudrv.wire.candump import LONGEST_LINE, CandumpDecoder, format_candump
+from imudrv.wire.candump import LONGEST_LINE, MOST_CHANNELS, CandumpDecoder, format_candump
 
 LINE = re.compile(
-    rb"\((\d{1,10})\.(\d{1,9})\)[ \t\r]+[^\x00-\x20]+[ \t\r]+([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})"
+    rb"\((\d{1,10})\.(\d{1,9})\)[ \t\r]+([^\x00-\x20]+)[ \t\r]+([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})"
     rb"#(#[0-9A-Fa-f])?((?:[0-9A-Fa-f]{2})*)(?:[ \t\r]+[RT])?[ \t\r]*"
 )
 
@@ -27,7 +27,13 @@ def record(t_ns: int, identifier: int, data: bytes, fd: bool = False) -> np.ndar
 
 def decoded(*pieces: bytes):
     """Messages and rejects of all pieces, the end included, with the accounting checked on the way."""
-    decoder = CandumpDecoder()
+    messages, rejects, _ = decoded_channel(None, *pieces)
+    return messages, rejects
+
+
+def decoded_channel(channel: str | None, *pieces: bytes):
+    """The same for a channel; with the number of messages of each channel in the log."""
+    decoder = CandumpDecoder(channel)
     found = []
     for piece in pieces:
         found.append(decoder.feed(piece))
@@ -37,30 +43,35 @@ def decoded(*pieces: bytes):
     assert decoder.pending == 0
     assert decoder.bytes_fed == sum(map(len, pieces))
     messages, rejects = zip(*found, strict=True)
-    return np.concatenate(messages), np.concatenate(rejects)
+    return np.concatenate(messages), np.concatenate(rejects), decoder.channels
 
 
-def read_by_expression(text: bytes):
-    """What `decoded` should give; every byte of `text` is looked at in exactly one line."""
+def read_by_expression(text: bytes, wanted: bytes | None):
+    """What `decoded_channel` should give; every byte of `text` is looked at in exactly one line."""
     messages, rejects = [np.zeros(0, MESSAGE)], []
+    channels: dict[str, int] = {}
     offset = 0
     for line in re.findall(rb"[^\n]*\n|[^\n]+", text):
         content = line.removesuffix(b"\n")
         reason = Reason.NOT_A_MESSAGE if line.endswith(b"\n") else Reason.UNFINISHED
         match = LINE.fullmatch(content) if len(content) <= LONGEST_LINE else None
         if match is not None:
-            seconds, fraction, identifier, fd, digits = match.groups()
+            seconds, fraction, channel, identifier, fd, digits = match.groups()
             data = bytes.fromhex(digits.decode())
             fits = int(identifier, 16) <= (0x7FF if len(identifier) == 3 else 0x1FFFFFFF)
             if fits and len(data) <= (64 if fd else 8) and int(seconds) < 9_223_372_035:
                 t_ns = int(seconds) * 10**9 + int(fraction.ljust(9, b"0"))
-                messages.append(record(t_ns, int(identifier, 16), data, fd is not None))
+                wanted = channel if wanted is None else wanted
+                if channel == wanted:
+                    messages.append(record(t_ns, int(identifier, 16), data, fd is not None))
+                name = channel.decode("ascii", "backslashreplace")
+                channels[name] = channels.get(name, 0) + 1
             else:
                 rejects.append((offset, len(line), reason))
         elif content.strip(b" \t\r") or len(content) > LONGEST_LINE:
             rejects.append((offset, len(line), reason))
         offset += len(line)
-    return np.concatenate(messages), np.array(rejects, REJECT)
+    return np.concatenate(messages), np.array(rejects, REJECT), channels
 
 
 GOOD = b"(1700000000.123456) can0 150#0001FFFF02004000\n"
@@ -199,10 +210,78 @@ LINES = st.one_of(
 
 
 @settings(deadline=None, max_examples=150)
-@given(st.lists(LINES, max_size=8).map(b"".join), st.lists(st.integers(0, 600), max_size=6))
-def test_any_text_in_any_pieces_gives_what_the_expression_gives(text, cuts):
+@given(
+    st.lists(LINES, max_size=8).map(b"".join),
+    st.lists(st.integers(0, 600), max_size=6),
+    st.sampled_from([None, "can0", "c", "can", "can00", ""]),
+)
+def test_any_text_in_any_pieces_gives_what_the_expression_gives(text, cuts, channel):
     edges = [0, *sorted(min(cut, len(text)) for cut in cuts), len(text)]
-    messages, rejects = decoded(*(text[a:b] for a, b in pairwise(edges)))
-    expected_messages, expected_rejects = read_by_expression(text)
+    pieces = [text[a:b] for a, b in pairwise(edges)]
+    messages, rejects, channels = decoded_channel(channel, *pieces)
+    wanted = None if channel is None else channel.encode()
+    expected_messages, expected_rejects, expected_channels = read_by_expression(text, wanted)
     assert np.array_equal(messages, expected_messages)
     assert rejects.tolist() == expected_rejects.tolist()
+    assert channels == expected_channels
+
+
+def lines_of(*channels: str) -> bytes:
+    """A message of each, numbered by its identifier."""
+    return b"".join(format_candump(record(0, n, b""), channel) for n, channel in enumerate(channels))
+
+
+def test_only_the_first_or_the_chosen_channel_comes_out() -> None:
+    log = lines_of("can1", "can0", "can1", "can10", "can", "can0")
+    for channel, ids in ((None, [0, 2]), ("can1", [0, 2]), ("can0", [1, 5]), ("can", [4]), ("can2", [])):
+        messages, rejects, channels = decoded_channel(channel, log)
+        assert messages["id"].tolist() == ids
+        assert rejects.size == 0
+        assert channels == {"can1": 2, "can0": 2, "can10": 1, "can": 1}
+
+
+def test_a_line_that_is_no_message_chooses_no_channel() -> None:
+    messages, _, channels = decoded_channel(None, b"(1.0) can9 150#0\n" + lines_of("can0", "can0"))
+    assert (messages.size, channels) == (2, {"can0": 2})
+
+
+def test_a_log_of_more_channels_than_are_told_apart_is_counted_whole() -> None:
+    names = [f"can{n}" for n in range(MOST_CHANNELS + 3)]
+    messages, _, channels = decoded_channel("can2", lines_of(*names * 2))
+    assert messages["id"].tolist() == [2, 2 + len(names)]
+    assert channels.pop("others") == 6
+    assert channels == dict.fromkeys(["can2", *names[:2], *names[3:MOST_CHANNELS]], 2)
+
+
+def test_a_second_channel_is_refused_from_its_first_message_on_unless_one_was_chosen() -> None:
+    chosen, open_to_any = CandumpDecoder("can0"), CandumpDecoder()
+    for decoder in (chosen, open_to_any):
+        for _ in range(3):
+            decoder.feed(lines_of(*["can0"] * 1000))
+            decoder.check_channel("any.log", "--channel ")
+        assert decoder.feed(lines_of("can1"))[0].size == 0
+    chosen.check_channel("any.log", "--channel ")
+    for _ in range(2):
+        with pytest.raises(
+            InputError,
+            match=r"any\.log: expected messages of one CAN channel, got those of can0 and can1; "
+            "choose one, as with --channel can0",
+        ):
+            open_to_any.check_channel("any.log", "--channel ")
+        open_to_any.feed(lines_of("can0"))
+
+
+@pytest.mark.parametrize("channel", ["can2", "", "can 0", "can0\0", "\0", "c" * 1000, "\ud800"])
+def test_a_channel_that_is_not_in_the_log_is_refused_at_its_end(channel: str) -> None:
+    decoder = CandumpDecoder(channel)
+    decoder.feed(lines_of("vcan3", "can1", "can0"))
+    decoder.check_channel("any.log", "--channel ")  # it may still come
+    decoder.close()
+    with pytest.raises(InputError, match="got those of can0, can1 and vcan3"):
+        decoder.check_channel("any.log", "--channel ")
+
+
+def test_names_of_channels_cannot_steer_a_terminal() -> None:
+    decoder = CandumpDecoder()
+    decoder.feed(b"(1.0) \x9b31m 150#00\n(1.0) \xe2\x80\xae 150#00\n")
+    assert list(decoder.channels) == [r"\x9b31m", r"\xe2\x80\xae"]
