@@ -175,7 +175,7 @@ class Profile(Model):
     byte_order: Literal["little", "big"]
     counts: Literal["increment", "total"]
     nominal: Nominal
-    messages: Annotated[tuple[Message, ...], Key(min_length=1, max_length=16)]
+    messages: Annotated[tuple[Message, ...], Key(min_length=1, max_length=wire.MAX_MESSAGES)]
     status_bits: Annotated[tuple[StatusBit, ...], Key(max_length=32)] = ()
 
     @field_validator("status_bits")

@@ -11,7 +11,7 @@ from imudrv.records import INCREMENTS, Records
 from imudrv.wire.check import compute
 from imudrv.wire.layout import Check, CheckKind, Layout, Message
 from imudrv.wire.stream import StreamDecoder
-from imudrv.wire.tables import message_tables
+from imudrv.wire.tables import layout_tables
 
 MAGIC: Final = b"I50N"
 VERSION: Final = 1
@@ -59,13 +59,14 @@ def encode(increments: Records, source: Source) -> bytes:
         76 a sample, back to back.
     """
     data = np.empty((len(increments), SIZE), np.uint8)
-    _fill(increments, data, data.view(DATAGRAM), int(source), _TABLES.check, _TABLES.crc_table)
+    _fill(increments, data, data.view(DATAGRAM), int(source), _KINDS)
     return data.tobytes()
 
 
 @kernel
-def _fill(increments, data, rows, source, check, crc_table):  # type: ignore[no-untyped-def]
-    """Write datagrams; `rows` and `data` are the same memory."""
+def _fill(increments: Records, data: NDArray[np.uint8], rows: Records, source: int, kinds: Records) -> None:
+    """Write datagrams; `rows`, shape (n, 1), and `data` are the same memory."""
+    check = kinds[0]["check"]
     for i in range(increments.shape[0]):
         sample, row, out = increments[i], rows[i, 0], data[i]
         for k in range(len(MAGIC)):
@@ -75,7 +76,7 @@ def _fill(increments, data, rows, source, check, crc_table):  # type: ignore[no-
         row["interval_ns"], row["t_ns"] = sample["interval_ns"], sample["t_ns"]
         for k in range(3):
             row["dtheta_b"][k], row["dv_b"][k] = sample["dtheta_b"][k], sample["dv_b"][k]
-        row["crc"] = np.uint32(compute(out, 0, check, crc_table))
+        row["crc"] = np.uint32(compute(out, 0, check))
 
 
 class Received(NamedTuple):
@@ -116,7 +117,7 @@ _LAYOUT: Final = Layout(
 )
 
 
-_TABLES: Final = message_tables(_LAYOUT, _LAYOUT.messages[0])
+_KINDS: Final = layout_tables(_LAYOUT)[0]
 
 
 class DatagramDecoder:

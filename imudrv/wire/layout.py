@@ -11,6 +11,9 @@ STATUS: Final = 7
 TEMPERATURE: Final = 8
 """Targets of a field: the counter, three gyro and three accelerometer axes, the status, then temperatures."""
 
+MAX_MESSAGES: Final = 16
+"""Kinds of message that a profile may have."""
+
 
 class CheckKind(IntEnum):
     """How a message is protected."""
