@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imudrv.kernels import kernel
-from imudrv.nav.attitude import rotate, rotation
+from imudrv.nav.attitude import rotate_about, rotation
 from imudrv.nav.vectors import Vector, add, cross, dot, row, scale
 from imudrv.sim.scenario import Rest, Rock, Rotate, Scenario, Start, Vibrate, intervals
 from imudrv.units import DEG, MM, NS, STANDARD_GRAVITY
@@ -539,7 +539,7 @@ def _into_b(v_n: Vector, segment: _Segment, turn: _Turn) -> Vector:
         scale(v_n[2], row(segment.C_nb, 2)),
     )
     for r in range(3):
-        v_b = rotate(v_b, row(segment.axes_b, r), turn.cosine[r], -turn.sine[r])
+        v_b = rotate_about(v_b, row(segment.axes_b, r), turn.cosine[r], -turn.sine[r])
     return add(v_b, cross(v_b, turn.case))
 
 
@@ -549,8 +549,8 @@ def _rates(segment: _Segment, body: Body, turn: _Turn, v: Array, a: Array, j: in
     omega, omega_dot = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     for r in range(3):
         u = row(segment.axes_b, r)
-        before = rotate(omega, u, turn.cosine[r], -turn.sine[r])
-        omega_dot = rotate(omega_dot, u, turn.cosine[r], -turn.sine[r])
+        before = rotate_about(omega, u, turn.cosine[r], -turn.sine[r])
+        omega_dot = rotate_about(omega_dot, u, turn.cosine[r], -turn.sine[r])
         omega_dot = add(omega_dot, add(scale(a[r, j], u), scale(v[r, j], cross(before, u))))
         omega = add(before, scale(v[r, j], u))
     omega_dot = add(omega_dot, add(cross(omega_dot, turn.case), cross(omega, turn.case_rate)))

@@ -10,12 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
+from size_effect import size_effect_increment
 
 from imudrv.errors import InputError
 from imudrv.nav.attitude import conjugate, product, quaternion_of_matrix, quaternion_of_vector, rotation, turn
 from imudrv.nav.earth import EARTH_RATE, ECCENTRICITY_SQUARED, SEMI_MAJOR_AXIS, earth_rate_n, normal_gravity
 from imudrv.nav.mechanisation import MEASUREMENT, NAVIGATION, Navigator, body_step
-from imudrv.nav.size_effect import size_effect_increment
 from imudrv.records import INCREMENTS, Records
 from imudrv.units import MM, NS, UG, URAD
 
