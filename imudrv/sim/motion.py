@@ -23,18 +23,17 @@ Left out: the change of gravity over the arm and the way, 3.1e-6 / s^2 (0.03 ug 
 """
 
 from math import ceil, cos, exp, floor, lgamma, log, pi, radians, sin
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from imudrv.arrays import Array
 from imudrv.kernels import kernel
 from imudrv.nav.attitude import rotate_about, rotation
 from imudrv.nav.vectors import Vector, add, cross, dot, row, scale
 from imudrv.sim.scenario import Rest, Rock, Rotate, Scenario, Start, Vibrate, intervals
 from imudrv.units import DEG, MM, NS, STANDARD_GRAVITY
-
-Array: TypeAlias = NDArray[np.float64]
 
 SINUSOIDS = 32
 """Sinusoids in a random motion."""
