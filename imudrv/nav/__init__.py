@@ -4,5 +4,6 @@ vectors        algebra on 3-tuples, inside numba kernels
 attitude       rotations and quaternions
 earth          WGS-84: gravity, rotation, radii
 alignment      attitude of a unit at rest
+noise          white noise and random walks from the variances of differences
 mechanisation  navigation, and its response to residual errors of the increments: H, B, P, Q
 """

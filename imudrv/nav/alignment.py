@@ -36,7 +36,6 @@ from math import atan2, hypot, sqrt, tan
 from typing import Final, NamedTuple
 
 import numpy as np
-from scipy.optimize import nnls
 
 from imudrv.arrays import Array
 from imudrv.errors import InputError
@@ -54,6 +53,7 @@ from imudrv.nav.attitude import (
 )
 from imudrv.nav.earth import EARTH_RATE, earth_rate_n
 from imudrv.nav.mechanisation import body_step
+from imudrv.nav.noise import fit_noise_model
 from imudrv.nav.vectors import Vector, add, put, vector_at
 from imudrv.records import Records
 from imudrv.units import DEG, NS, NS_PER_S
@@ -384,12 +384,10 @@ def _noise(v: Array, dt: Array, gravity: float) -> _Noise:
     lags = 2 ** np.arange(int(np.log2(len(v) / 6)) + 1)
     thirds = [v[3 * k :] - 3.0 * v[2 * k : -k] + 3.0 * v[k : -2 * k] - v[: -3 * k] for k in lags]
     variance = np.array([np.mean(third**2) for third in thirds])
-    laws = np.stack([np.full(len(lags), 20.0), gravity**2 * (lags * dt.mean()) ** 3], axis=1)
+    model = np.stack([np.full(len(lags), 20.0), gravity**2 * (lags * dt.mean()) ** 3], axis=1)
     # a variance over lag L comes from 1 / L as many independent differences
     weight = 1.0 / (np.maximum(variance, _LEAST_VELOCITY**2) * np.sqrt(lags))
-    size = np.linalg.norm(laws * weight[:, None], axis=0)
-    parts, _ = nnls(laws * weight[:, None] / size, variance * weight)
-    velocity, tilt = np.sqrt(parts / size).tolist()
+    velocity, tilt = np.sqrt(fit_noise_model(variance, model, weight)).tolist()
     return _Noise(max(velocity, _LEAST_VELOCITY), tilt)
 
 
