@@ -58,11 +58,11 @@ from imudrv.nav.vectors import Vector, add, put, vector_at
 from imudrv.records import Records
 from imudrv.units import DEG, NS, NS_PER_S
 
-DURATION_S: Final = 370.0
+ALIGNMENT_S: Final = 370.0
 """Usual length of an alignment, s."""
-SHORTEST_S: Final = 30.0
+MIN_ALIGNMENT_S: Final = 30.0
 """Minimum length, s."""
-LONGEST_S: Final = 7200.0
+MAX_ALIGNMENT_S: Final = 7200.0
 """Maximum length, s."""
 MAX_LATITUDE: Final = 85.0 * DEG
 """Nearer to a pole the Earth's rotation does not give the heading."""
@@ -168,16 +168,17 @@ class Alignment:
         latitude_rad: float,
         gyro_bias_sigma: float,
         accelerometer_bias_sigma: float,
-        duration_s: float = DURATION_S,
+        duration_s: float = ALIGNMENT_S,
     ) -> None:
         if not abs(latitude_rad) <= MAX_LATITUDE:
             raise InputError(
                 f"alignment: expected a latitude within {MAX_LATITUDE / DEG:g} deg of the equator, got "
                 f"{latitude_rad / DEG:g} deg; nearer to a pole give the attitude by other means"
             )
-        if not SHORTEST_S <= duration_s <= LONGEST_S:
+        if not MIN_ALIGNMENT_S <= duration_s <= MAX_ALIGNMENT_S:
             raise InputError(
-                f"alignment: expected a length of {SHORTEST_S:g} to {LONGEST_S:g} s, got {duration_s:g} s"
+                f"alignment: expected a length of {MIN_ALIGNMENT_S:g} to {MAX_ALIGNMENT_S:g} s, "
+                f"got {duration_s:g} s"
             )
         if not (0.0 <= gyro_bias_sigma < np.inf and 0.0 <= accelerometer_bias_sigma < np.inf):
             raise InputError(
@@ -234,9 +235,9 @@ class Alignment:
         InputError
             Too little was fed, or gravity or the Earth's rotation is not in it.
         """
-        if self.elapsed_s < SHORTEST_S:
+        if self.elapsed_s < MIN_ALIGNMENT_S:
             raise InputError(
-                f"alignment: expected {SHORTEST_S:g} s of samples at least, got {self.elapsed_s:g} s; "
+                f"alignment: expected {MIN_ALIGNMENT_S:g} s of samples at least, got {self.elapsed_s:g} s; "
                 "feed more"
             )
         s = self._state[0]
