@@ -282,5 +282,5 @@ def _report(capture: Capture, output: Path) -> None:
     for reason, rejected in sorted(capture.rejected.items()):
         name = reason.name.lower().replace("_", " ")
         first = ", ".join(map(str, rejected.first))
-        more = ", ..." if rejected.stretches > len(rejected.first) else ""
-        print(f"  {name}: {rejected.stretches} x, {rejected.length} in all, at {first}{more}")
+        more = ", ..." if rejected.runs > len(rejected.first) else ""
+        print(f"  {name}: {rejected.runs} x, {rejected.length} in all, at {first}{more}")

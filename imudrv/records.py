@@ -80,20 +80,19 @@ INCREMENTS: Final = np.dtype(
 """One sample of compensated increments, body axes."""
 
 REJECT: Final = np.dtype([("offset", np.int64), ("length", np.int64), ("reason", np.int64)])
-"""A stretch of input that is not a frame."""
+"""A run of input that is not a frame."""
 
 
 class Reason(IntEnum):
-    """Why a stretch of input is not a frame."""
+    """Why a run of input is not a frame."""
 
     NO_SYNC = 1
     CHECK_FAILED = 2
     UNFINISHED = 3
-    FOREIGN_ID = 4
-    WRONG_LENGTH = 5
-    TORN = 6
-    STALE = 7
-    NOT_A_MESSAGE = 8
+    WRONG_LENGTH = 4
+    TORN = 5
+    STALE = 6
+    NOT_A_MESSAGE = 7
 
 
 class Flag(IntFlag):

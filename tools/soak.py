@@ -487,7 +487,7 @@ def three_ways(folder: Path, wire: str) -> list[Check]:
         service.stop()
     live, status = last_status(Recording(recording))
     again = decoded(recording, wire)
-    stretches = {name: tuple(kind.values()) for name, kind in status["rejected"].items()}
+    runs = {name: tuple(kind.values()) for name, kind in status["rejected"].items()}
     return [
         Check(f"{wire}: the account closes", str(offline), offline.closes and offline.lost > 0),
         Check(
@@ -496,9 +496,9 @@ def three_ways(folder: Path, wire: str) -> list[Check]:
             live == offline,
         ),
         Check(
-            f"{wire}: what was no frame, stretches and length by reason",
+            f"{wire}: what was no frame, runs and length by reason",
             ", ".join(f"{name} {count} {length}" for name, (count, length) in rejected.items()),
-            stretches == rejected,
+            runs == rejected,
         ),
         Check(
             f"{wire}: the recording decoded again",
@@ -516,13 +516,13 @@ def captured(folder: Path, wire: str) -> Path:
 
 
 def decoded(path: Path, wire: str) -> tuple[Account, dict[str, tuple[int, int]]]:
-    """Decode a capture as `imudrv decode` does: account, and stretches and length by reason."""
+    """Decode a capture as `imudrv decode` does: account, and runs and length by reason."""
     capture = Capture(path, profiles.load(wire))
     for _ in capture.pulses(lambda _: None):
         pass
     rejected = sorted(capture.rejected.items())
     return capture.accountant.account, {
-        reason.name.lower(): (stretch.stretches, stretch.length) for reason, stretch in rejected
+        reason.name.lower(): (entry.runs, entry.length) for reason, entry in rejected
     }
 
 
