@@ -163,7 +163,7 @@ class SensingPoints(Model):
 
 
 class SizeEffect(Model):
-    """Where the accelerometers sense, in a stated gauge."""
+    """Sensing points of the accelerometers, in a stated gauge."""
 
     r_mm: SensingPoints
     gauge: Literal["centroid", "x", "y", "z", "given"]
@@ -198,7 +198,7 @@ class SizeEffect(Model):
 
 
 class Temperature(Model):
-    """How biases and scale factors change per kelvin from the reference; the range where that was found."""
+    """Change of biases and scale factors per kelvin from the reference, and the range of validity."""
 
     reference_degc: Celsius
     range_degc: Annotated[tuple[Celsius, Celsius], AfterValidator(_range)]
@@ -231,8 +231,8 @@ class Temperature(Model):
 class Calibration(Model):
     """The certificate of one unit.
 
-    Without `size_effect` it is not compensated; without `temperature` nothing depends on it. `provenance`
-    says how the calibration was found; it is kept as it is.
+    Without `size_effect` this is not compensated; without `temperature` nothing depends on it. `provenance`
+    describes how the calibration was made; it is preserved unchanged.
     """
 
     format: Literal["imu50-calibration"]
@@ -251,7 +251,7 @@ class Calibration(Model):
 
 
 def read_calibration(path: str | os.PathLike[str], unit: str | None = None) -> Calibration:
-    """Read a calibration, and make sure that it belongs to the unit.
+    """Read a calibration, and check that it belongs to the unit.
 
     Parameters
     ----------
@@ -275,7 +275,7 @@ def read_calibration(path: str | os.PathLike[str], unit: str | None = None) -> C
 
 
 def require_unit(calibration: Calibration, unit: str | None, name: str) -> None:
-    """Make sure that a calibration belongs to the unit.
+    """Check that a calibration belongs to the unit.
 
     Parameters
     ----------
@@ -284,7 +284,7 @@ def require_unit(calibration: Calibration, unit: str | None, name: str) -> None:
     unit : str or None
         Serial number of the unit that is connected; None: any.
     name : str
-        What the message calls the certificate.
+        Name of the certificate in the message.
 
     Raises
     ------
@@ -299,7 +299,7 @@ def require_unit(calibration: Calibration, unit: str | None, name: str) -> None:
 
 
 def write_calibration(path: str | os.PathLike[str], calibration: Calibration) -> None:
-    """Write a calibration; the file that was there is kept under its date.
+    """Write a calibration; an existing file is kept under a name with its date.
 
     Parameters
     ----------
@@ -317,7 +317,7 @@ def write_calibration(path: str | os.PathLike[str], calibration: Calibration) ->
 
 
 def coefficients(calibration: Calibration) -> Coefficients:
-    """Put a calibration into the form that the compensation reads.
+    """Convert a calibration into the form that the compensation reads.
 
     Parameters
     ----------

@@ -17,7 +17,7 @@ MAX_TEMPERATURES: Final = 6
 """Temperature channels that a profile may have."""
 
 NO_TEMPERATURE: Final = -(2**31)
-"""Temperature counts of a channel that has not been heard yet."""
+"""Temperature counts of a channel from which nothing has been received yet."""
 
 MESSAGE: Final = np.dtype(
     [
@@ -45,7 +45,7 @@ FRAME: Final = np.dtype(
     ],
     align=True,
 )
-"""One good frame as the wire had it."""
+"""One good frame as received."""
 
 PULSES: Final = np.dtype(
     [
@@ -58,7 +58,7 @@ PULSES: Final = np.dtype(
         ("interval_ns", np.int64),  # that the pulses cover
         ("gyro", np.int64, 3),
         ("accelerometer", np.int64, 3),
-        ("temperature_degc", np.float64, MAX_TEMPERATURES),  # NaN: not known
+        ("temperature_degc", np.float64, MAX_TEMPERATURES),  # NaN: unknown
         ("status", np.uint32),
         ("flags", np.uint32),
     ],

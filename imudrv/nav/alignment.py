@@ -105,7 +105,7 @@ STATE: Final = np.dtype(
     ],
     align=True,
 )
-"""What one call of the kernel leaves to the next, beside the blocks."""
+"""State that a call of the kernel leaves to the next, beside the blocks."""
 
 
 @dataclass(frozen=True)

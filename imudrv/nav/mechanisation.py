@@ -102,7 +102,7 @@ CONSTANTS: Final = np.dtype(
     ],
     align=True,
 )
-"""What the kernels know of a navigation."""
+"""Constants of a navigation."""
 
 STATE: Final = np.dtype(
     [
@@ -119,10 +119,10 @@ STATE: Final = np.dtype(
     ],
     align=True,
 )
-"""What one call of the kernels leaves to the next."""
+"""State that a call of the kernels leaves to the next."""
 
 MATRICES: Final = np.dtype(_MATRICES)
-"""The state of the measurement matrices."""
+"""State of the measurement matrices."""
 
 NEAR: Final = 0.01
 """Distance to the north or up for which the Earth's terms are reused, m; they take a third of the time."""
@@ -329,7 +329,7 @@ def _navigate(
     for i in range(increments.shape[0]):
         sample = increments[i]
         T = sample["interval_ns"] * NS
-        # element by element: a helper for three costs 2 ns a sample
+        # element by element: a helper for three costs 2 ns per sample
         dtheta = (sample["dtheta_b"][0], sample["dtheta_b"][1], sample["dtheta_b"][2])
         dv = (sample["dv_b"][0], sample["dv_b"][1], sample["dv_b"][2])
         before = now

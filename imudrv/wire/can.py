@@ -1,4 +1,4 @@
-"""CAN messages to frames: puts the messages of one sample together and finds its full counter."""
+"""CAN messages to frames: joins the messages of one sample and determines its full counter."""
 
 from typing import Final
 
@@ -14,7 +14,7 @@ from imudrv.wire.tables import Tables, layout_tables
 OPEN_SAMPLES: Final = 4
 """Incomplete samples kept at a time: the order of ids may interleave neighbours."""
 LATE: Final = 64
-"""A message up to this many samples behind the newest one is doubled; farther, the unit has restarted."""
+"""A message at most this many samples before the newest is a duplicate; if older, the unit has restarted."""
 
 _MAX_LENGTH: Final = 64
 _ROOM: Final = _MAX_LENGTH + SLACK
@@ -28,7 +28,7 @@ CONSTANTS: Final = np.dtype(
     ],
     align=True,
 )
-"""What the kernels know of a layout beside its tables."""
+"""Constants of a layout, beside its tables."""
 
 SLOT: Final = np.dtype(
     [
@@ -60,7 +60,7 @@ STATE: Final = np.dtype(
     ],
     align=True,
 )
-"""What one call of the kernels leaves to the next."""
+"""State that a call of the kernels leaves to the next."""
 
 _NO_FRAMES: Final = np.zeros(0, FRAME)
 _NO_REJECTS: Final = np.zeros(0, REJECT)
@@ -72,17 +72,17 @@ _STALE: Final = int(Reason.STALE)
 
 
 class CanAssembler:
-    """Assembler of a CAN profile's samples; feed it messages as they come, in any pieces.
+    """Assembler of a CAN profile's samples; feed it messages as they arrive, in any pieces.
 
-    A sample is complete when all messages that come with every sample have come with the same counter. The
-    incomplete ones before it are then given up: their messages are `TORN`. A second message of the same kind
-    and counter, or one for a sample up to `LATE` behind the newest, is `STALE`. A counter farther behind
-    means that the unit has restarted, and what is known of it is forgotten.
+    A sample is complete when all messages that come with every sample have come with the same counter. Older
+    incomplete samples are then given up: their messages are `TORN`. A second message of the same kind and
+    counter, or one for a sample at most `LATE` before the newest, is `STALE`. An older counter means that the
+    unit has restarted, and its former state is forgotten.
 
-    Messages that come with each k-th sample only (temperatures, status, full counter) hold from then on;
-    temperatures are `NO_TEMPERATURE` before. Where such a message has a wider counter than the samples, they
-    are held until the first one gives their full counter, at most 2 k samples; if none comes they go out
-    counted on from the first one's own counter. A later one that disagrees is believed from then on.
+    Messages that come with every k-th sample only (temperatures, status, full counter) hold from then on;
+    temperatures are `NO_TEMPERATURE` before. If such a message has a wider counter than the samples, these
+    are held until the first one gives their full counter, at most 2 k samples; without one they are released
+    with counters that continue the first one's own. A later full counter that disagrees is used from then on.
 
     The frames and rejects are the same for any cut into pieces, and every message fed is part of a frame, a
     reject, `slow`, `foreign` or `pending`. It does not matter whether a message was CAN FD: identifier,
@@ -91,7 +91,7 @@ class CanAssembler:
     Parameters
     ----------
     layout : Layout
-        Of a CAN profile.
+        Layout of a CAN profile.
     """
 
     def __init__(self, layout: Layout) -> None:
@@ -126,7 +126,7 @@ class CanAssembler:
 
     @property
     def counter_disagreements(self) -> int:
-        """How often a full counter was not the one expected."""
+        """Number of full counters that were not the expected ones."""
         return int(self._state[0]["disagreements"])
 
     def feed(self, messages: Records) -> Decoded:
@@ -140,9 +140,9 @@ class CanAssembler:
         Returns
         -------
         Decoded
-            What became complete with them. `offset` of a frame is the index of the message that completed it,
-            `t_ns` that message's; `offset` of a reject is the index of the message, `length` 1. Indices count
-            all messages ever fed.
+            Frames and rejects that they complete. `offset` of a frame is the index of the message that
+            completed it, `t_ns` that message's time; `offset` of a reject is the index of the message,
+            `length` 1. Indices count all messages ever fed.
         """
         held = self._held.size
         frames = np.zeros(held + messages.size, FRAME)

@@ -1,4 +1,4 @@
-"""Text of a candump log to CAN messages and back, a line a message.
+"""Text of a candump log to CAN messages and back, one line per message.
 
     (1700000000.123456) can0 150#0001FFFF02004000            classic, id of 3 or 8 hex digits
     (1700000000.123456) can0 158##1000102...                 CAN FD: ``##`` and one digit of flags
@@ -34,7 +34,7 @@ _DIGITS = np.frombuffer(b"0123456789ABCDEF", np.uint8).copy()
 
 
 class CandumpDecoder:
-    """Decoder of candump log text; feed it as it comes, in any pieces.
+    """Decoder of candump log text; feed it text as it arrives, in any pieces.
 
     The messages and rejects are the same for any cut of the text into pieces, and every byte fed is in the
     line of a message, in a blank line, in a reject (its line, whole) or among the `pending` ones. Remote
@@ -225,14 +225,14 @@ def format_candump(messages: Records, channel: str = "can0") -> bytes:
     Parameters
     ----------
     messages : ndarray of MESSAGE, shape (n,)
-        What to write.
+        The messages.
     channel : str
         Name of the interface.
 
     Returns
     -------
     bytes
-        One line a message: ``(seconds.micro) channel ID#DATA``, for CAN FD ``ID##1DATA``.
+        One line per message: ``(seconds.micro) channel ID#DATA``, for CAN FD ``ID##1DATA``.
 
     Raises
     ------

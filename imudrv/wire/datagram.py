@@ -1,4 +1,4 @@
-"""The output datagram `I50N`, version 1: 76 bytes a sample, one or more in a packet (ICD, section 7)."""
+"""The output datagram `I50N`, version 1: 76 bytes per sample, one or more in a packet (ICD, section 7)."""
 
 from enum import IntEnum
 from typing import Final, NamedTuple
@@ -36,7 +36,7 @@ _SAME: Final = ("flags", "counter", "interval_ns", "t_ns", "dtheta_b", "dv_b")
 
 
 class Source(IntEnum):
-    """Where the samples come from."""
+    """Origin of the samples."""
 
     HARDWARE = 0
     REPLAY = 1
@@ -44,19 +44,19 @@ class Source(IntEnum):
 
 
 def encode(increments: Records, source: Source) -> bytes:
-    """Datagrams of compensated increments.
+    """Encode compensated increments as datagrams.
 
     Parameters
     ----------
     increments : ndarray of INCREMENTS
-        In order; the counter goes out modulo 2^32.
+        In order; the counter is sent modulo 2^32.
     source : Source
-        Where they come from.
+        Origin of the samples.
 
     Returns
     -------
     bytes
-        76 a sample, back to back.
+        76 per sample, back to back.
     """
     data = np.empty((len(increments), SIZE), np.uint8)
     _fill(increments, data, data.view(DATAGRAM), int(source), _KINDS)
@@ -80,7 +80,7 @@ def _fill(increments: Records, data: NDArray[np.uint8], rows: Records, source: i
 
 
 class Received(NamedTuple):
-    """What a `DatagramDecoder` found.
+    """Samples and rejects of a `DatagramDecoder`.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ class Received(NamedTuple):
     source : ndarray of uint8
         `Source` of each.
     rejects : ndarray of REJECT
-        Stretches that are no datagram.
+        Runs of bytes that are no datagram.
     """
 
     increments: Records
@@ -138,7 +138,7 @@ class DatagramDecoder:
         Returns
         -------
         Received
-            What became complete with them.
+            Samples and rejects that they complete.
         """
         begin = self._finder.bytes_fed - self._finder.pending
         buffer = np.concatenate([self._tail, np.frombuffer(data, np.uint8)])

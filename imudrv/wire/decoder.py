@@ -37,7 +37,7 @@ class FrameDecoder:
     Parameters
     ----------
     layout : Layout
-        Of the profile.
+        Layout of the profile.
     """
 
     def __init__(self, layout: Layout) -> None:
@@ -45,7 +45,7 @@ class FrameDecoder:
         self._decoder = CanAssembler(layout) if layout.can else StreamDecoder(layout)
 
     def feed(self, data: bytes | memoryview | Records, t_ns: int = 0) -> Records:
-        """Take in what arrived.
+        """Decode what arrived.
 
         Parameters
         ----------
@@ -97,7 +97,7 @@ class CaptureDecoder:
     Parameters
     ----------
     layout : Layout
-        Of the profile.
+        Layout of the profile.
     """
 
     def __init__(self, layout: Layout) -> None:
@@ -106,7 +106,7 @@ class CaptureDecoder:
 
     @property
     def rejected(self) -> dict[Reason, RejectedRuns]:
-        """What is no frame, by reason."""
+        """Rejected runs, by reason."""
         return self._frames.rejected
 
     def feed(self, data: bytes | memoryview) -> Records:

@@ -1,4 +1,4 @@
-"""Pulses to the bytes of a stream or to CAN messages: the simulator's and the tests' direction."""
+"""Pulses to the bytes of a stream or to CAN messages, for the simulator and the tests."""
 
 from typing import Final
 
@@ -22,12 +22,12 @@ _NAMES: Final = (
 
 
 class _Encoder:
-    """What both encoders share: the numbers of every field, checked, and the running totals.
+    """Common part of the encoders: the numbers of every field, checked, and the running totals.
 
     Parameters
     ----------
     layout : Layout
-        What is encoded.
+        Layout of the profile.
     totals : array_like of int, shape (6,)
         Running totals before the first sample, gyro and accelerometer X Y Z; for profiles with totals.
     """
@@ -38,7 +38,7 @@ class _Encoder:
         self._totals = np.array(totals, np.int64)
 
     def _numbers(self, pulses: Records) -> NDArray[np.int64]:
-        """Give the number of each target, shape (n, `_TARGETS`), one column a target."""
+        """Return the number of each target, shape (n, `_TARGETS`), one column for each target."""
         numbers = np.zeros((pulses.size, _TARGETS), np.int64)
         numbers[:, COUNTER] = pulses["counter"]
         numbers[:, GYRO:ACCELEROMETER] = pulses["gyro"]
@@ -71,7 +71,7 @@ class _Encoder:
 
     def _require_room(self, numbers: NDArray[np.int64], field: Field) -> None:
         column = numbers[:, field.target]
-        # A total of n bits tells increments apart like a signed number of n bits.
+        # A total of n bits distinguishes as many increments as a signed number of n bits.
         is_total = self._layout.totals and field.target != STATUS
         lowest, highest = _limits(field.bits, field.signed or is_total)
         outside = (column < lowest) | (column > highest)
@@ -81,28 +81,28 @@ class _Encoder:
                 f"sample {int(numbers[first, COUNTER])}, {_NAMES[field.target]}: "
                 f"expected {lowest} to {highest}, the {field.bits} bits of profile {self._layout.name}, "
                 f"got {int(column[first])}; "
-                "take a profile with wider fields, or calmer motion"
+                "use a profile with wider fields, or slower motion"
             )
 
 
 class StreamEncoder(_Encoder):
-    """Encoder of a stream profile; the running totals go on from call to call.
+    """Encoder of a stream profile; the running totals continue from call to call.
 
     Parameters
     ----------
     layout : Layout
-        Of a stream profile.
+        Layout of a stream profile.
     totals : array_like of int, shape (6,)
         Running totals before the first sample, gyro and accelerometer X Y Z; for profiles with totals.
     """
 
     def encode(self, pulses: Records) -> NDArray[np.uint8]:
-        """Write samples.
+        """Encode samples.
 
         Parameters
         ----------
         pulses : ndarray of PULSES, shape (n,)
-            Each of one interval. Counters go out modulo the width of their field; temperatures are rounded
+            Each of one interval. Counters are sent modulo the width of their field; temperatures are rounded
             and clipped to theirs, NaN becomes 0 counts.
 
         Returns
@@ -119,18 +119,18 @@ class StreamEncoder(_Encoder):
 
 
 class CanEncoder(_Encoder):
-    """Encoder of a CAN profile; the running totals go on from call to call.
+    """Encoder of a CAN profile; the running totals continue from call to call.
 
     Parameters
     ----------
     layout : Layout
-        Of a CAN profile.
+        Layout of a CAN profile.
     totals : array_like of int, shape (6,)
         Running totals before the first sample, gyro and accelerometer X Y Z; for profiles with totals.
     """
 
     def encode(self, pulses: Records) -> Records:
-        """Write samples.
+        """Encode samples.
 
         Parameters
         ----------

@@ -20,7 +20,7 @@ STATE: Final = np.dtype(
     ],
     align=True,
 )
-"""What one call of the kernel leaves to the next."""
+"""State that a call of the kernel leaves to the next."""
 
 _NO_SYNC: Final = int(Reason.NO_SYNC)
 _CHECK_FAILED: Final = int(Reason.CHECK_FAILED)
@@ -29,14 +29,14 @@ _NO_REJECTS: Final = np.zeros(0, REJECT)
 
 
 class Decoded(NamedTuple):
-    """What a decoder found.
+    """Frames and rejects of a decoder.
 
     Parameters
     ----------
     frames : ndarray of FRAME
         Good frames in the order of arrival.
     rejects : ndarray of REJECT
-        Stretches that are no frame, each with its `Reason`.
+        Runs of input that are no frame, each with its `Reason`.
     """
 
     frames: Records
@@ -44,15 +44,15 @@ class Decoded(NamedTuple):
 
 
 class StreamDecoder:
-    """Decoder of a byte stream; feed it as it comes, in any pieces.
+    """Decoder of a byte stream; feed it bytes as they arrive, in any pieces.
 
     The frames and rejects are the same for any cut of the stream into pieces, and every byte fed is in a
-    frame, in a reject, or among the `pending` ones. After damage the search resumes one byte on.
+    frame, in a reject, or among the `pending` ones. After a bad frame the search resumes at its second byte.
 
     Parameters
     ----------
     layout : Layout
-        Of a stream profile.
+        Layout of a stream profile.
     """
 
     def __init__(self, layout: Layout) -> None:
@@ -87,7 +87,7 @@ class StreamDecoder:
         Returns
         -------
         Decoded
-            What became complete with them.
+            Frames and rejects that they complete.
         """
         piece = np.frombuffer(data, np.uint8)
         stop = self._pending + piece.size

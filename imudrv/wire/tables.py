@@ -54,7 +54,7 @@ def layout_tables(layout: Layout) -> Tables:
     Parameters
     ----------
     layout : Layout
-        Of the profile.
+        Layout of the profile.
 
     Returns
     -------
