@@ -43,7 +43,7 @@ from imudrv.config import Model
 from imudrv.console import BAD_INPUT, OK, CommandLine, progress
 from imudrv.errors import InputError
 from imudrv.imu.rate_filter import NAMES, rate_filter
-from imudrv.nav.alignment import DURATION_S
+from imudrv.nav.alignment import ALIGNMENT_S
 from imudrv.outputs import file_to_write, require_other
 from imudrv.recording import Recording
 from imudrv.sinks.files import replacing
@@ -167,7 +167,7 @@ def _commands() -> CommandLine:
     sub.add_argument(
         "--align",
         type=float,
-        default=DURATION_S,
+        default=ALIGNMENT_S,
         metavar="S",
         help="alignment on recordings (default: %(default)g s)",
     )

@@ -55,7 +55,7 @@ from calib.runs import GUARD_S, Priors
 from calib.segments import BLOCK_NS, LEAST_FORCE, QUIET_S, SIGMAS, Rotation, Segmenter, judge
 from imudrv.calibration import Calibration
 from imudrv.errors import InputError
-from imudrv.nav.alignment import SHORTEST_S, Aligned, Alignment
+from imudrv.nav.alignment import MIN_ALIGNMENT_S, Aligned, Alignment
 from imudrv.nav.attitude import Quaternion, conjugate, turn
 from imudrv.nav.earth import EARTH_RATE, normal_gravity
 from imudrv.nav.mechanisation import Navigator
@@ -727,7 +727,7 @@ class _Attempt:
         self.aligned: Aligned | None = None
         self.heading = 0.0  # how far it stood turned clockwise, rad
         self.means = Means()
-        self.look_s = SHORTEST_S  # when the alignment is looked at next
+        self.look_s = MIN_ALIGNMENT_S  # when the alignment is looked at next
         self.turn = Turn()
         self._held: list[Records] = []
         self._behind: Records | None = None  # samples behind the alignment's window

@@ -38,7 +38,7 @@ from scipy.spatial.transform import Rotation as Attitude
 from calib.runs import AFTER_S, BEFORE_S, GUARD_S, Priors, Run
 from calib.segments import BIN_S, BLOCK_NS, Noise, Rest, Rotation, pooled_noise
 from imudrv.errors import InputError
-from imudrv.nav.alignment import DURATION_S, Aligned
+from imudrv.nav.alignment import ALIGNMENT_S, Aligned
 from imudrv.nav.earth import earth_rate_n, normal_gravity
 from imudrv.nav.mechanisation import Navigator
 from imudrv.records import INCREMENTS
@@ -670,7 +670,7 @@ def _ideal(planned: Planned, k: int, latitude_rad: float, priors: Priors) -> Run
     return Run(
         f"plan#{k + 1}",
         rotation,
-        Aligned(0, 0, q_nb, DURATION_S, level, heading, None),
+        Aligned(0, 0, q_nb, ALIGNMENT_S, level, heading, None),
         gravity,
         rows,
         rows["v_n"],

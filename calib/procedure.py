@@ -23,7 +23,7 @@ from calib.runs import Priors
 from calib.segments import Noise
 from imudrv.config import Model, read
 from imudrv.errors import InputError
-from imudrv.nav.alignment import LONGEST_S, SHORTEST_S
+from imudrv.nav.alignment import MAX_ALIGNMENT_S, MIN_ALIGNMENT_S
 from imudrv.site import Site
 from imudrv.units import DEG_PER_SQRT_H
 
@@ -72,7 +72,7 @@ class Pose(Model):
     up: Side
     east: Side
     turn_deg: Literal[180, -180]
-    align_s: Annotated[float, Key(ge=SHORTEST_S, le=LONGEST_S)] | None = None
+    align_s: Annotated[float, Key(ge=MIN_ALIGNMENT_S, le=MAX_ALIGNMENT_S)] | None = None
     rest_s: Annotated[float, Key(ge=2, le=600)] | None = None
     repeats: Annotated[int, Key(ge=1, le=20)] = 1
 
@@ -126,7 +126,7 @@ class Procedure(Model):
     format: Literal["imu50-procedure"]
     version: Literal[1]
     name: Annotated[str, Key(min_length=1, max_length=80)]
-    align_s: Annotated[float, Key(ge=SHORTEST_S, le=LONGEST_S)] = 370.0
+    align_s: Annotated[float, Key(ge=MIN_ALIGNMENT_S, le=MAX_ALIGNMENT_S)] = 370.0
     rest_s: Annotated[float, Key(ge=2, le=600)] = 15.0
     limits: Limits = Limits()
     poses: Annotated[tuple[Pose, ...], Key(min_length=1, max_length=100)]

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from calib.low_pass import without_dither
 from calib.segments import BLOCK_NS, Limits, Rotation, Segments, find_segments, judge
-from imudrv.nav.alignment import DURATION_S, SHORTEST_S, Aligned, Alignment
+from imudrv.nav.alignment import ALIGNMENT_S, MIN_ALIGNMENT_S, Aligned, Alignment
 from imudrv.nav.earth import normal_gravity
 from imudrv.nav.mechanisation import MEASUREMENT, Navigator
 from imudrv.records import Records
@@ -192,8 +192,8 @@ class _OpenRun:
         self._label, self._rotation, self._interval_s = label, rotation, interval_s
         self._C_ba, self._site = C_ba, site
         rest_s = rotation.before.duration_s
-        navigated_s = min(BEFORE_S, rest_s - SHORTEST_S)
-        aligned_s = min(DURATION_S, rest_s - navigated_s)
+        navigated_s = min(BEFORE_S, rest_s - MIN_ALIGNMENT_S)
+        aligned_s = min(ALIGNMENT_S, rest_s - navigated_s)
         self._begin = rotation.start - round(navigated_s / interval_s)
         self._next = self._begin - round(aligned_s / interval_s)  # counter of the first sample wanted
         self._stop = min(rotation.after.stop, rotation.stop + round(AFTER_S / interval_s))

@@ -23,7 +23,7 @@ from imudrv import profiles
 from imudrv.calibration import Accelerometer, Calibration, Gyro, SensingPoints, SizeEffect, coefficients
 from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import RateFilterName, rate_filter
-from imudrv.nav.alignment import DURATION_S
+from imudrv.nav.alignment import ALIGNMENT_S
 from imudrv.records import Flag, Records
 from imudrv.sim import scenario as scenarios
 from imudrv.sim.scenario import NOMINAL, Residuals, Rest, Scenario, Segment, Unit
@@ -110,7 +110,7 @@ def really(unit: Unit, seed: int) -> Calibration:
     )
 
 
-def scenario(name: str, align_s: float = DURATION_S) -> Scenario:
+def scenario(name: str, align_s: float = ALIGNMENT_S) -> Scenario:
     """The scenario of a trial: a shipped one, its first rest long enough.
 
     Parameters
@@ -138,7 +138,7 @@ def trial(
     who: Subject,
     seed: int,
     *,
-    align_s: float = DURATION_S,
+    align_s: float = ALIGNMENT_S,
     filter_name: RateFilterName = RATE_FILTER,
     skew_s: float = 0.0,
 ) -> Trial:

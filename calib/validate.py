@@ -39,7 +39,7 @@ from imudrv.errors import InputError
 from imudrv.imu.coefficients import Coefficients
 from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import RateFilterName, rate_filter
-from imudrv.nav.alignment import DURATION_S, Aligned, Alignment
+from imudrv.nav.alignment import ALIGNMENT_S, Aligned, Alignment
 from imudrv.nav.earth import SEMI_MAJOR_AXIS, normal_gravity
 from imudrv.nav.mechanisation import Navigator
 from imudrv.records import Flag, Records
@@ -87,7 +87,7 @@ class Setting:
     layout: Layout
     calibration: Calibration
     site: Site
-    align_s: float = DURATION_S
+    align_s: float = ALIGNMENT_S
     rate_filter: RateFilterName = RATE_FILTER
     skew_s: float = 0.0
 

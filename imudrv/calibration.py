@@ -8,25 +8,23 @@ import os
 from typing import Annotated, Final, Literal, Self, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import AfterValidator, JsonValue, model_validator
 from pydantic import Field as Key
 
+from imudrv.arrays import Array
 from imudrv.config import Matrix3, Model, UtcTime, read, write
 from imudrv.errors import InputError
 from imudrv.imu.coefficients import Coefficients, TemperatureTerms
 from imudrv.units import ARCSEC, DEG_PER_H, MM, PPM, UG
 
-Array: TypeAlias = NDArray[np.float64]
-
 NORM_TOLERANCE: Final = 0.1
-"""Most that a row or column of an axes matrix may differ from length 1."""
+"""Largest deviation from 1 of the length of a row or column of an axes matrix."""
 MIN_DETERMINANT: Final = 0.5
-"""Least magnitude of an axes matrix's determinant: axes may be exchanged or reversed, not nearly parallel."""
+"""Smallest magnitude of an axes matrix's determinant: axes may be exchanged or reversed, but not parallel."""
 GAUGE_TOLERANCE_MM: Final = 1e-5
-"""Most that a gauge may be missed: ten times what rounding to six decimals leaves."""
+"""Largest deviation from the stated gauge: ten times the rounding to six decimals."""
 COVARIANCE_TOLERANCE_MM2: Final = 5e-6
-"""Most that a covariance may miss symmetry and sign: nine entries, each rounded to six decimals."""
+"""Largest asymmetry and negative eigenvalue of a covariance: nine entries, each rounded to six decimals."""
 MAX_PROVENANCE: Final = 1 << 18
 """Largest provenance, characters of JSON."""
 
@@ -36,7 +34,7 @@ Matrix9: TypeAlias = tuple[Row9, Row9, Row9, Row9, Row9, Row9, Row9, Row9, Row9]
 
 def _axes(matrix: Matrix3) -> Matrix3:
     C = np.array(matrix)
-    with np.errstate(over="ignore"):  # infinite is told below
+    with np.errstate(over="ignore"):  # infinity is reported below
         norms = np.concatenate([np.linalg.norm(C, axis=1), np.linalg.norm(C, axis=0)])
     worst = norms[np.argmax(np.abs(norms - 1.0))]
     if abs(worst - 1.0) > NORM_TOLERANCE:
@@ -119,7 +117,7 @@ class Gyro(Model):
 
     @property
     def scale_rad_per_pulse(self) -> Array:
-        """Scale factors, rad a pulse, shape (3,), gyro axes."""
+        """Scale factors, rad per pulse, shape (3,), gyro axes."""
         return _array(self.scale_arcsec_per_pulse, ARCSEC)
 
     @property
@@ -165,7 +163,7 @@ class SensingPoints(Model):
 
 
 class SizeEffect(Model):
-    """Where the accelerometers sense, in a stated gauge."""
+    """Sensing points of the accelerometers, in a stated gauge."""
 
     r_mm: SensingPoints
     gauge: Literal["centroid", "x", "y", "z", "given"]
@@ -200,7 +198,7 @@ class SizeEffect(Model):
 
 
 class Temperature(Model):
-    """How biases and scale factors change per kelvin from the reference; the range where that was found."""
+    """Change of biases and scale factors per kelvin from the reference, and the range of validity."""
 
     reference_degc: Celsius
     range_degc: Annotated[tuple[Celsius, Celsius], AfterValidator(_range)]
@@ -233,8 +231,8 @@ class Temperature(Model):
 class Calibration(Model):
     """The certificate of one unit.
 
-    Without `size_effect` it is not compensated; without `temperature` nothing depends on it. `provenance`
-    says how the calibration was found; it is kept as it is.
+    Without `size_effect` this is not compensated; without `temperature` nothing depends on it. `provenance`
+    describes how the calibration was made; it is preserved unchanged.
     """
 
     format: Literal["imu50-calibration"]
@@ -247,9 +245,13 @@ class Calibration(Model):
     temperature: Temperature | None = None
     provenance: Annotated[dict[str, JsonValue], AfterValidator(_provenance)] | None = None
 
+    def without_size_effect(self) -> Self:
+        """Return the same calibration with which the size effect is not compensated."""
+        return self.model_copy(update={"size_effect": None})
+
 
 def read_calibration(path: str | os.PathLike[str], unit: str | None = None) -> Calibration:
-    """Read a calibration, and make sure that it belongs to the unit.
+    """Read a calibration, and check that it belongs to the unit.
 
     Parameters
     ----------
@@ -273,7 +275,7 @@ def read_calibration(path: str | os.PathLike[str], unit: str | None = None) -> C
 
 
 def require_unit(calibration: Calibration, unit: str | None, name: str) -> None:
-    """Make sure that a calibration belongs to the unit.
+    """Check that a calibration belongs to the unit.
 
     Parameters
     ----------
@@ -282,7 +284,7 @@ def require_unit(calibration: Calibration, unit: str | None, name: str) -> None:
     unit : str or None
         Serial number of the unit that is connected; None: any.
     name : str
-        What the message calls the certificate.
+        Name of the certificate in the message.
 
     Raises
     ------
@@ -297,7 +299,7 @@ def require_unit(calibration: Calibration, unit: str | None, name: str) -> None:
 
 
 def write_calibration(path: str | os.PathLike[str], calibration: Calibration) -> None:
-    """Write a calibration; the file that was there is kept under its date.
+    """Write a calibration; an existing file is kept under a name with its date.
 
     Parameters
     ----------
@@ -315,7 +317,7 @@ def write_calibration(path: str | os.PathLike[str], calibration: Calibration) ->
 
 
 def coefficients(calibration: Calibration) -> Coefficients:
-    """Put a calibration into the form that the compensation reads.
+    """Convert a calibration into the form that the compensation reads.
 
     Parameters
     ----------

@@ -15,7 +15,7 @@ from imudrv.profiles import Profile
 from imudrv.recording import Recording
 from imudrv.records import Flag, Reason, Records
 from imudrv.wire.candump import CandumpDecoder
-from imudrv.wire.decoder import CaptureDecoder, FrameDecoder, Rejected
+from imudrv.wire.decoder import CaptureDecoder, FrameDecoder, RejectedRuns
 
 CHUNK_BYTES = 1 << 19
 """Read at once: small enough for the cache, large enough that Python's part does not show."""
@@ -71,7 +71,7 @@ class Capture:
         )
 
     @property
-    def rejected(self) -> dict[Reason, Rejected]:
+    def rejected(self) -> dict[Reason, RejectedRuns]:
         """What was no frame, by reason."""
         return self._decoder.rejected
 

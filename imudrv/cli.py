@@ -327,8 +327,8 @@ def _report(capture: Capture, output: Path) -> None:
     for reason, rejected in sorted(capture.rejected.items()):
         name = reason.name.lower().replace("_", " ")
         first = ", ".join(map(str, rejected.first))
-        more = ", ..." if rejected.stretches > len(rejected.first) else ""
-        print(f"  {name}: {rejected.stretches} x, {rejected.length} in all, at {first}{more}", file=words)
+        more = ", ..." if rejected.runs > len(rejected.first) else ""
+        print(f"  {name}: {rejected.runs} x, {rejected.length} in all, at {first}{more}", file=words)
     for channel, messages in list(capture.channels.items())[1:]:
         print(f"  left out: {messages} messages of channel {channel}", file=words)
 

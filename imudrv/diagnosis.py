@@ -43,7 +43,7 @@ class Heard:
     counts : SampleCounts
         Where the samples went.
     rejected : dict of Reason to int
-        Stretches that are no frame.
+        Number of runs that are no frame.
     messages : dict of int to int
         On CAN how many of each identifier of the profile.
     set_bits : tuple of str
@@ -93,7 +93,7 @@ def hear(profile: Profile, data: bytes | Records) -> Heard:
         # what lies before is the end of a frame that had begun earlier
         decoder = FrameDecoder(layout)
         frames = decoder.feed(data[frames["offset"][0] :])
-    rejected = {reason: entry.stretches for reason, entry in decoder.rejected.items()}
+    rejected = {reason: entry.runs for reason, entry in decoder.rejected.items()}
     if layout.can:
         frames = np.concatenate([frames, decoder.close()])  # held until their full counter comes
     tracker = SequenceTracker(layout)

@@ -74,7 +74,7 @@ def view(status: Status) -> RenderableType:
     add("rate", f"{status['rate_hz']:.1f} of {status['nominal_rate_hz']:g} samples/s, {samples['good']} good")
     losses = [f"{samples[name]} {name.replace('_', ' ')}" for name in _LOSSES if samples[name]]
     add("losses", ", ".join(losses) or "none", "yellow" if losses else "")
-    if rejected := [f"{r['stretches']} {name.replace('_', ' ')}" for name, r in status["rejected"].items()]:
+    if rejected := [f"{r['runs']} {name.replace('_', ' ')}" for name, r in status["rejected"].items()]:
         add("no frames", ", ".join(rejected), "yellow")
     skew = "unknown" if clock["skew_ppm"] is None else f"{clock['skew_ppm']:+.2f} ppm"
     add(

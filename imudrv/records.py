@@ -17,7 +17,7 @@ MAX_TEMPERATURES: Final = 6
 """Temperature channels that a profile may have."""
 
 NO_TEMPERATURE: Final = -(2**31)
-"""Temperature counts of a channel that has not been heard yet."""
+"""Temperature counts of a channel from which nothing has been received yet."""
 
 MESSAGE: Final = np.dtype(
     [
@@ -45,7 +45,7 @@ FRAME: Final = np.dtype(
     ],
     align=True,
 )
-"""One good frame as the wire had it."""
+"""One good frame as received."""
 
 PULSES: Final = np.dtype(
     [
@@ -58,7 +58,7 @@ PULSES: Final = np.dtype(
         ("interval_ns", np.int64),  # that the pulses cover
         ("gyro", np.int64, 3),
         ("accelerometer", np.int64, 3),
-        ("temperature_degc", np.float64, MAX_TEMPERATURES),  # NaN: not known
+        ("temperature_degc", np.float64, MAX_TEMPERATURES),  # NaN: unknown
         ("status", np.uint32),
         ("flags", np.uint32),
     ],
@@ -80,20 +80,19 @@ INCREMENTS: Final = np.dtype(
 """One sample of compensated increments, body axes."""
 
 REJECT: Final = np.dtype([("offset", np.int64), ("length", np.int64), ("reason", np.int64)])
-"""A stretch of input that is not a frame."""
+"""A run of input that is not a frame."""
 
 
 class Reason(IntEnum):
-    """Why a stretch of input is not a frame."""
+    """Why a run of input is not a frame."""
 
     NO_SYNC = 1
     CHECK_FAILED = 2
     UNFINISHED = 3
-    FOREIGN_ID = 4
-    WRONG_LENGTH = 5
-    TORN = 6
-    STALE = 7
-    NOT_A_MESSAGE = 8
+    WRONG_LENGTH = 4
+    TORN = 5
+    STALE = 6
+    NOT_A_MESSAGE = 7
 
 
 class Flag(IntFlag):

@@ -446,7 +446,7 @@ class Service:
                 "closes": counts.closes,
             },
             "rejected": {
-                reason.name.lower(): {"stretches": r.stretches, "length": r.length}
+                reason.name.lower(): {"runs": r.runs, "length": r.length}
                 for reason, r in sorted(self._pipeline.decoder.rejected.items())
             },
             "clock": clock._asdict(),

@@ -1,10 +1,11 @@
-"""Where the unit stands: the site file."""
+"""Place of the unit: the site file."""
 
 from typing import Annotated, Literal
 
 from pydantic import Field as Key
 
 from imudrv.config import Model
+from imudrv.nav.earth import normal_gravity
 from imudrv.units import DEG
 
 
@@ -27,3 +28,10 @@ class Site(Model):
     def longitude_rad(self) -> float:
         """Longitude, rad, east positive."""
         return self.longitude_deg * DEG
+
+    @property
+    def gravity(self) -> float:
+        """Gravity, m/s^2: the measured one, or normal gravity where there is no measurement."""
+        if self.gravity_m_s2 is not None:
+            return self.gravity_m_s2
+        return normal_gravity(self.latitude_rad, self.height_m)

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from imudrv.calibration import Calibration, coefficients, read_calibration, write_calibration
 from imudrv.config import kind, parse, read, write
 from imudrv.errors import FaultyFileError, InputError
+from imudrv.nav.earth import normal_gravity
 from imudrv.site import Site
 
 # The example of the files' specification.
@@ -365,6 +366,15 @@ def test_a_written_certificate_keeps_the_one_before(tmp_path: Path) -> None:
     assert read_calibration(tmp_path / "cal.yaml").serial_number == "50-0018"
 
 
+def test_without_its_size_effect_a_calibration_is_otherwise_the_same() -> None:
+    whole = calibration()
+    bare = whole.without_size_effect()
+    assert whole.size_effect is not None
+    assert bare.size_effect is None
+    assert coefficients(bare).r_b is None
+    assert bare.model_dump(exclude={"size_effect"}) == whole.model_dump(exclude={"size_effect"})
+
+
 def test_the_supplied_calibration_and_site_read(reference: Path) -> None:
     supplied = read_calibration(reference / "calibration.yaml", unit="50-0017")
     assert supplied.gyro.scale_arcsec_per_pulse[0] == 0.44611747767685633
@@ -385,6 +395,12 @@ def test_a_site_needs_neither_format_nor_gravity() -> None:
     assert site.latitude_rad == pytest.approx(np.radians(28.2), rel=5e-16)
     assert site.longitude_rad == pytest.approx(np.radians(113.0), rel=5e-16)
     assert parse({**SITE, "format": "imu50-site", "version": 1}, Site, "site.yaml") == site
+
+
+def test_gravity_of_a_site_is_the_measured_one_or_the_normal_one() -> None:
+    normal = parse(SITE, Site, "site.yaml")
+    assert normal.gravity == normal_gravity(normal.latitude_rad, 60.0)
+    assert parse({**SITE, "gravity_m_s2": 9.7917}, Site, "site.yaml").gravity == 9.7917
 
 
 def test_a_written_site_says_that_it_is_one(tmp_path: Path) -> None:

@@ -127,6 +127,6 @@ def test_the_size_effect_of_rocking_is_taken_off_to_a_tenth_of_a_micrometre_a_se
     error = np.abs(increments["dv_b"] - truth["dv_b"])[compensated]
     assert error.max() < 1e-7
     # What there was to take off is a thousand times larger.
-    uncompensated = calibration.model_copy(update={"size_effect": None})
+    uncompensated = calibration.without_size_effect()
     without, truth = driven("imu50-canfd", run, uncompensated)
     assert np.abs(without["dv_b"] - truth["dv_b"]).max() > 1e-4

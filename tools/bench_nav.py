@@ -8,7 +8,6 @@ its documentation shows; it integrates attitude, velocity and place and knows no
 import resource
 import tempfile
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -58,7 +57,7 @@ OTHER_REPEATS: Final = 15
 """Part of the hour that python-ins gets: it keeps all it makes, some 400 bytes a sample."""
 STAGES: Final = ("capture to velocity, H, B, P, Q", "navigate, with H, B, P, Q", "navigate, without")
 OTHER: Final = "python-ins, no H"
-KNOWN: Final = replace(coefficients(NOMINAL), r_b=None)
+KNOWN: Final = coefficients(NOMINAL.without_size_effect())
 
 
 class Timing(NamedTuple):
@@ -137,16 +136,7 @@ def _compensator() -> Compensator:
 
 
 def _navigator(q_nb: NDArray[np.float64], *, matrices: bool) -> Navigator:
-    site = SCENARIO.site
-    return Navigator(
-        site.latitude_rad,
-        site.longitude_rad,
-        site.height_m,
-        None,
-        q_nb,
-        C_ba=KNOWN.C_ba if matrices else None,
-        every=EVERY,
-    )
+    return Navigator.from_site(SCENARIO.site, q_nb, C_ba=KNOWN.C_ba if matrices else None, every=EVERY)
 
 
 def _through(path: Path, q_nb: NDArray[np.float64]) -> float:

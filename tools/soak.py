@@ -488,7 +488,7 @@ def three_ways(folder: Path, wire: str) -> list[Check]:
         service.stop()
     live, status = last_status(Recording(recording))
     again = decoded(recording, wire)
-    stretches = {name: tuple(kind.values()) for name, kind in status["rejected"].items()}
+    runs = {name: tuple(kind.values()) for name, kind in status["rejected"].items()}
     return [
         Check(f"{wire}: the counts add up", str(offline), offline.closes and offline.lost > 0),
         Check(
@@ -497,9 +497,9 @@ def three_ways(folder: Path, wire: str) -> list[Check]:
             live == offline,
         ),
         Check(
-            f"{wire}: what was no frame, stretches and length by reason",
+            f"{wire}: what was no frame, runs and length by reason",
             ", ".join(f"{name} {count} {length}" for name, (count, length) in rejected.items()),
-            stretches == rejected,
+            runs == rejected,
         ),
         Check(
             f"{wire}: the recording decoded again",
@@ -517,13 +517,13 @@ def captured(folder: Path, wire: str) -> Path:
 
 
 def decoded(path: Path, wire: str) -> tuple[SampleCounts, dict[str, tuple[int, int]]]:
-    """Decode a capture as `imudrv decode` does: sample counts, and stretches and length by reason."""
+    """Decode a capture as `imudrv decode` does: sample counts, and runs and length by reason."""
     capture = Capture(path, profiles.load(wire))
     for _ in capture.pulses(lambda _: None):
         pass
     rejected = sorted(capture.rejected.items())
     return capture.tracker.counts, {
-        reason.name.lower(): (stretch.stretches, stretch.length) for reason, stretch in rejected
+        reason.name.lower(): (entry.runs, entry.length) for reason, entry in rejected
     }
 
 

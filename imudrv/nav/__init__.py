@@ -1,8 +1,8 @@
 """Strapdown mathematics, pure: no files, no clock, no settings; kernels that live and offline code share.
 
-attitude       rotations
+attitude       rotations and quaternions
 earth          WGS-84: gravity, rotation, radii
-alignment      attitude of a unit that stands still
-mechanisation  navigation, and how it answers to what is left in the increments: H, B, P, Q
-size_effect    the size effect as numpy formulas
+alignment      attitude of a unit at rest
+noise          white noise and random walks from the variances of differences
+mechanisation  navigation, and its response to residual errors of the increments: H, B, P, Q
 """

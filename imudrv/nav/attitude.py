@@ -1,6 +1,6 @@
-"""Rotations. `R = rotation(u, angle)` turns vectors by `angle` about `u`, right-handed.
+"""Rotations. `R = rotation(u, angle)` rotates vectors by `angle` about `u`, right-handed.
 
-Post-multiplied to an attitude it turns the body about its own axis: `C_nb2 = C_nb1 @ R`.
+Post-multiplied to an attitude it rotates the body about its own axis: `C_nb2 = C_nb1 @ R`.
 
 Quaternions are Hamilton's, scalar first, and multiply as matrices do: `q_nb = product(q_na, q_ab)`.
 """
@@ -9,24 +9,39 @@ from math import cos, sin, sqrt
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from imudrv.arrays import Array
 from imudrv.kernels import kernel
 from imudrv.vectors import Vector, add, cross, dot, scale
 
 Quaternion: TypeAlias = tuple[float, float, float, float]
+Matrix: TypeAlias = tuple[Vector, Vector, Vector]
+"""By rows."""
 
 
 @kernel
-def rotate(v: Vector, u: Vector, cosine: float, sine: float) -> Vector:
-    """Turn the vector `v` about the unit vector `u` by the angle of that cosine and sine (Rodrigues).
+def quaternion_at(a: Array) -> Quaternion:
+    """Return the four elements of an array."""
+    return a[0], a[1], a[2], a[3]
+
+
+@kernel
+def put_quaternion(a: Array, q: Quaternion) -> None:
+    """Set the four elements of an array."""
+    a[0], a[1], a[2], a[3] = q
+
+
+@kernel
+def rotate_about(v: Vector, u: Vector, cosine: float, sine: float) -> Vector:
+    """Rotate the vector `v` about the unit vector `u` by the angle of that cosine and sine (Rodrigues).
 
     Parameters
     ----------
     v, u : tuple of 3 float
         In the same axes.
     cosine, sine : float
-        Of the angle; with `-sine` the turn is undone.
+        Those of the angle; `-sine` rotates back.
 
     Returns
     -------
@@ -36,7 +51,7 @@ def rotate(v: Vector, u: Vector, cosine: float, sine: float) -> Vector:
     return add(add(scale(cosine, v), along), scale(sine, cross(u, v)))
 
 
-def rotation(axis: ArrayLike, angle_rad: float) -> NDArray[np.float64]:
+def rotation(axis: ArrayLike, angle_rad: float) -> Array:
     """Return the matrix of the rotation by `angle_rad` about `axis`.
 
     Parameters
@@ -49,13 +64,13 @@ def rotation(axis: ArrayLike, angle_rad: float) -> NDArray[np.float64]:
     Returns
     -------
     ndarray, shape (3, 3)
-        Identical in the axes before and after, for both see the axis alike.
+        The same in the axes before and after, because the axis has the same components in both.
     """
     u = np.asarray(axis, np.float64)
     u = u / np.linalg.norm(u)
     unit = tuple(u.tolist())
     columns = [
-        rotate(e, unit, cos(angle_rad), sin(angle_rad))
+        rotate_about(e, unit, cos(angle_rad), sin(angle_rad))
         for e in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     ]
     return np.array(columns).T
@@ -63,7 +78,7 @@ def rotation(axis: ArrayLike, angle_rad: float) -> NDArray[np.float64]:
 
 @kernel
 def product(p: Quaternion, q: Quaternion) -> Quaternion:
-    """`p q`: the rotation q first, then p, both as turns of vectors."""
+    """Return `p q`: the rotation q first, then p, both rotating vectors."""
     return (
         p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
         p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
@@ -74,13 +89,13 @@ def product(p: Quaternion, q: Quaternion) -> Quaternion:
 
 @kernel
 def conjugate(q: Quaternion) -> Quaternion:
-    """Turn that undoes `q`."""
+    """Return the inverse rotation of the unit quaternion `q`."""
     return q[0], -q[1], -q[2], -q[3]
 
 
 @kernel
 def unit(q: Quaternion) -> Quaternion:
-    """Bring a length that is all but 1 back to 1: a step of Newton's towards `q / |q|`."""
+    """Renormalise a nearly unit quaternion by one Newton step."""
     s = 1.5 - 0.5 * (q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     return s * q[0], s * q[1], s * q[2], s * q[3]
 
@@ -97,7 +112,7 @@ def quaternion_of_vector(phi: Vector) -> Quaternion:
     Returns
     -------
     tuple of 4 float
-        `cos(|phi| / 2), sin(|phi| / 2) phi / |phi|`; below 0.1 rad as series, which leave out 1e-15.
+        `cos(|phi| / 2), sin(|phi| / 2) phi / |phi|`; below 0.1 rad as series, truncated at 1e-15.
     """
     x = dot(phi, phi)
     if x < 0.01:
@@ -111,15 +126,15 @@ def quaternion_of_vector(phi: Vector) -> Quaternion:
 
 @kernel
 def turn(q: Quaternion, v: Vector) -> Vector:
-    """Vector `v` turned by the unit quaternion `q`: `v_n = turn(q_nb, v_b)`."""
+    """Rotate the vector `v` by the unit quaternion `q`: `v_n = turn(q_nb, v_b)`."""
     u = (q[1], q[2], q[3])
     t = scale(2.0, cross(u, v))
     return add(v, add(scale(q[0], t), cross(u, t)))
 
 
 @kernel
-def rows_of(q: Quaternion) -> tuple[Vector, Vector, Vector]:
-    """Rows of the rotation matrix of a quaternion of any length but zero."""
+def rows_of(q: Quaternion) -> Matrix:
+    """Return the rotation matrix of a quaternion of any length but zero, by rows."""
     w, x, y, z = q
     s = 2.0 / (w * w + x * x + y * y + z * z)
     return (
@@ -129,7 +144,7 @@ def rows_of(q: Quaternion) -> tuple[Vector, Vector, Vector]:
     )
 
 
-def quaternion_of_matrix(R: ArrayLike) -> NDArray[np.float64]:
+def quaternion_of_matrix(R: ArrayLike) -> Array:
     """Quaternion of a rotation matrix.
 
     Parameters
@@ -140,7 +155,7 @@ def quaternion_of_matrix(R: ArrayLike) -> NDArray[np.float64]:
     Returns
     -------
     ndarray, shape (4,)
-        Scalar first and not negative. The largest component is found first, so that nothing cancels
+        Scalar first and not negative. The largest component is computed first, so that nothing cancels
         (Shepperd, Journal of Guidance and Control 1 (1978) 223).
     """
     m = np.asarray(R, np.float64)
@@ -153,5 +168,5 @@ def quaternion_of_matrix(R: ArrayLike) -> NDArray[np.float64]:
         ]
     )
     row = four_products[np.argmax(np.diag(four_products))]
-    q: NDArray[np.float64] = row / np.copysign(np.linalg.norm(row), row[0])
+    q: Array = row / np.copysign(np.linalg.norm(row), row[0])
     return q

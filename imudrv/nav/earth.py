@@ -1,4 +1,4 @@
-"""The Earth as WGS-84 has it: normal gravity and rotation.
+"""The Earth of WGS-84: normal gravity, rotation, radii of curvature.
 
 Source: NIMA TR8350.2, Department of Defense World Geodetic System 1984, third edition, 2000, tables 3.1 to
 3.4 and equations 4-1 to 4-3.
@@ -13,9 +13,9 @@ from imudrv.vectors import Vector
 EARTH_RATE: Final = 7.292115e-5
 """Rotation rate of the Earth, rad/s."""
 SEMI_MAJOR_AXIS: Final = 6378137.0
-"""Of the ellipsoid, m."""
+"""Semi-major axis of the ellipsoid, m."""
 FLATTENING: Final = 1.0 / 298.257223563
-"""Of the ellipsoid."""
+"""Flattening of the ellipsoid."""
 ECCENTRICITY_SQUARED: Final = FLATTENING * (2.0 - FLATTENING)
 """First eccentricity of the ellipsoid, squared."""
 GRAVITY_EQUATOR: Final = 9.7803253359
@@ -33,9 +33,9 @@ def normal_gravity(latitude_rad: float, height_m: float) -> float:
     Parameters
     ----------
     latitude_rad : float
-        Geodetic.
+        Geodetic latitude, rad.
     height_m : float
-        Above the ellipsoid; the series holds to 0.01 ug up to 10 km.
+        Height above the ellipsoid, m; the series holds to 0.01 ug up to 10 km.
 
     Returns
     -------
@@ -57,7 +57,7 @@ def earth_rate_n(latitude_rad: float) -> Vector:
     Parameters
     ----------
     latitude_rad : float
-        Geodetic.
+        Geodetic latitude, rad.
 
     Returns
     -------
@@ -69,17 +69,17 @@ def earth_rate_n(latitude_rad: float) -> Vector:
 
 @kernel
 def radii(latitude_rad: float) -> tuple[float, float]:
-    """Radii of curvature of the ellipsoid.
+    """Return the radii of curvature of the ellipsoid.
 
     Parameters
     ----------
     latitude_rad : float
-        Geodetic.
+        Geodetic latitude, rad.
 
     Returns
     -------
     tuple of 2 float
-        Of the meridian (north-south) and of the prime vertical (east-west), m.
+        Radius of the meridian (north-south) and of the prime vertical (east-west), m.
     """
     x = 1.0 - ECCENTRICITY_SQUARED * sin(latitude_rad) ** 2
     prime_vertical = SEMI_MAJOR_AXIS / sqrt(x)

@@ -22,13 +22,13 @@ from the same model: for `omega = w0 + w1 t` coning is `w0 x w1 T^3 / 12`, and `
 `w0 x w1 T T1 (T + T1) / 2`. Left out: terms in zeta^2 (8e-14 m/s^2 at 1 ms) and that the Earth's terms change
 within an interval, or while latitude and height stay within a centimetre: 3e-8 m/s^2, 1e-13 rad/s.
 
-**The measurement matrices** say how the navigated velocity answers to what is left in the increments
-(mathematics, sections 2 and 4). All of it is measured minus true, to first order:
+**The measurement matrices** say how the navigated velocity responds to residual errors of the increments
+(mathematics, sections 2 and 4). All errors are measured minus true, to first order:
 
     delta v_n = H R + B b + f_n x (phi_0 t - Q vec(dG))        phi = phi_0 - P vec(dG)
 
     H (3, 9)  R: sensing points (r_x, r_y, r_z) that were not compensated, m
-    B (3, 3)  b: bias left in the specific force, body axes, m/s^2; the integral of C_nb
+    B (3, 3)  b: residual bias of the specific force, body axes, m/s^2; the integral of C_nb
     P (3, 9)  dG by rows: scale and misalignment, `dG @ omega_ib_b` too much rate; integral of C_nb kron omega
     Q (3, 9)  the integral of P
 
@@ -37,75 +37,127 @@ A size effect also acts back through Coriolis' acceleration (1.5e-3 of it in 10 
     dH/dt = C_nb S - 2 omega_ie x H
 
 and a common shift of the sensing points, which is a true motion, leaves no velocity at rest. Not in the
-matrices: gravity at a place in error (`1.5e-6 t^2 / 2`: 1e-4 after 12 s), the speed over ground in Coriolis'
-term and, in B, P and Q, the Earth's rotation (7e-5 t).
+matrices: gravity at a wrong position (`1.5e-6 t^2 / 2`: 1e-4 after 12 s), the speed over ground in the
+Coriolis term and, in B, P and Q, the Earth's rotation (7e-5 t).
 
 H is causal, without lag: the rate at an interval's end comes from this interval and the two before, exact for
-a rate quadratic in time. Before the first interval the body rests on the Earth, so that no noise of a first
-rate, which would stay in H for ever, comes in.
+a rate quadratic in time. Before the first interval the body rests on the Earth, so that the noise of a first
+rate, which would stay in H forever, does not enter.
 
-Time for which there are no increments is not navigated; a row bears the flags of its sample.
+Time without increments is not navigated; a row has the flags of its sample.
 """
 
 from math import cos, sin, sqrt
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Protocol, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from imudrv.arrays import Array
 from imudrv.errors import InputError
 from imudrv.kernels import kernel
-from imudrv.nav.attitude import Quaternion, conjugate, product, quaternion_of_vector, rows_of, turn, unit
+from imudrv.nav.attitude import (
+    Matrix,
+    Quaternion,
+    conjugate,
+    product,
+    put_quaternion,
+    quaternion_at,
+    quaternion_of_vector,
+    rows_of,
+    turn,
+    unit,
+)
 from imudrv.nav.earth import SEMI_MAJOR_AXIS, earth_rate_n, normal_gravity, radii
 from imudrv.records import Records
 from imudrv.units import NS
 from imudrv.vectors import Vector, add, cross, dot, put, scale, subtract, vector_at
 
-NAVIGATION: Final = np.dtype(
-    [
-        ("counter", np.int64),
-        ("t_ns", np.int64),  # end of the interval
-        ("flags", np.int64),  # of the sample
-        ("q_nb", np.float64, 4),  # scalar first
-        ("v_n", np.float64, 3),  # east, north, up, m/s
-        ("latitude_rad", np.float64),
-        ("longitude_rad", np.float64),
-        ("height_m", np.float64),
-    ]
-)
-"""Where the unit is, how fast and how turned, at the end of a sample."""
-
-MEASUREMENT: Final = np.dtype(
-    [
-        *((name, *NAVIGATION.fields[name][:1]) for name in NAVIGATION.names or ()),  # type: ignore[index]
-        ("H", np.float64, (3, 9)),
-        ("B", np.float64, (3, 3)),
-        ("P", np.float64, (3, 9)),
-        ("Q", np.float64, (3, 9)),
-    ]
-)
+_NAVIGATION: Final = [
+    ("counter", np.int64),
+    ("t_ns", np.int64),  # end of the interval
+    ("flags", np.int64),  # of the sample
+    ("q_nb", np.float64, 4),  # scalar first
+    ("v_n", np.float64, 3),  # east, north, up, m/s
+    ("latitude_rad", np.float64),
+    ("longitude_rad", np.float64),
+    ("height_m", np.float64),
+]
+_MATRICES: Final = [
+    ("H", np.float64, (3, 9)),
+    ("B", np.float64, (3, 3)),
+    ("P", np.float64, (3, 9)),
+    ("Q", np.float64, (3, 9)),
+]
+NAVIGATION: Final = np.dtype(_NAVIGATION)
+"""Attitude, velocity and position at the end of a sample."""
+MEASUREMENT: Final = np.dtype([*_NAVIGATION, *_MATRICES])
 """`NAVIGATION` and the measurement matrices."""
 
+CONSTANTS: Final = np.dtype(
+    [
+        ("gravity_offset", np.float64),  # of measured from normal gravity, m/s^2
+        ("C_ba", np.float64, (3, 3)),
+        ("a_b", np.float64, (3, 3)),  # row i: sensing axis of accelerometer i
+    ],
+    align=True,
+)
+"""Constants of a navigation."""
+
+STATE: Final = np.dtype(
+    [
+        ("q_nb", np.float64, 4),
+        ("v_n", np.float64, 3),
+        ("position", np.float64, 3),  # latitude and longitude, rad, height, m
+        ("T1", np.float64),  # the interval before, s, rad, m/s
+        ("dtheta1", np.float64, 3),
+        ("dv1", np.float64, 3),
+        ("T2", np.float64),  # and the one before that
+        ("dtheta2", np.float64, 3),
+        ("omega1", np.float64, 3),  # rate at the end of the interval before, rad/s
+        ("earth_at", np.float64, 2),  # latitude, rad, and height, m, of the Earth's terms
+    ],
+    align=True,
+)
+"""State that a call of the kernels leaves to the next."""
+
+MATRICES: Final = np.dtype(_MATRICES)
+"""State of the measurement matrices."""
+
 NEAR: Final = 0.01
-"""So far to the north or up the Earth's terms serve, m: they take a third of the time of navigation."""
+"""Distance to the north or up for which the Earth's terms are reused, m; they take a third of the time."""
 
 MAX_LATITUDE: Final = 1.5
 """Largest latitude, rad: east and north have no meaning at the poles."""
 
-# The state, one array of floats: what a row of output has, then what the next step needs besides.
-_Q, _V, _PLACE, _H, _B, _P, _IP = 0, 4, 7, 10, 37, 46, 73
-_T1, _DTHETA1, _DV1, _T2, _DTHETA2, _OMEGA, _EARTH = 100, 101, 104, 107, 108, 111, 114
-_STATE: Final = 116
-_HEAD: Final = 3  # words of a row before its floats
+
+class Place(Protocol):
+    """A place on the Earth, such as `imudrv.site.Site`."""
+
+    @property
+    def latitude_rad(self) -> float:
+        """Geodetic latitude, rad."""
+
+    @property
+    def longitude_rad(self) -> float:
+        """Longitude, rad."""
+
+    @property
+    def height_m(self) -> float:
+        """Height above the ellipsoid, m."""
+
+    @property
+    def gravity_m_s2(self) -> float | None:
+        """Measured gravity, m/s^2, if there is a measurement."""
 
 
 class Navigator:
-    """Navigation from a known attitude and place; any chunks give the same bits.
+    """Navigation from a known attitude and position; any chunks give the same bits.
 
     Parameters
     ----------
     latitude_rad, longitude_rad, height_m : float
-        Where it starts.
+        Position at the start.
     gravity_m_s2 : float or None
         Measured there. Its difference from normal gravity is added everywhere. None: normal gravity.
     q_nb : array_like, shape (4,)
@@ -115,7 +167,7 @@ class Navigator:
     C_ba : array_like, shape (3, 3), optional
         Accelerometer axes to body. With it rows are `MEASUREMENT`, and the body must rest at the start.
     every : int
-        Only each so-manieth sample makes a row, counted from the start.
+        Only every n-th sample makes a row, counted from the start.
 
     Raises
     ------
@@ -141,7 +193,7 @@ class Navigator:
                 f"navigation: expected q_nb of length 1 within 1e-6, got {np.linalg.norm(q):.9g}; "
                 "normalise it"
             )
-        place = _checked("latitude, longitude, height", (latitude_rad, longitude_rad, height_m), (3,))
+        position = _checked("latitude, longitude, height", (latitude_rad, longitude_rad, height_m), (3,))
         if abs(latitude_rad) > MAX_LATITUDE:
             raise InputError(
                 f"navigation: expected a latitude of at most {MAX_LATITUDE} rad, got {latitude_rad:.9g}; "
@@ -149,26 +201,49 @@ class Navigator:
             )
         if every < 1:
             raise InputError(f"navigation: expected a row every 1 or more samples, got {every}")
-        self._gravity_offset = 0.0
-        if gravity_m_s2 is not None:
-            self._gravity_offset = gravity_m_s2 - normal_gravity(latitude_rad, height_m)
-        self._matrices = C_ba is not None
+        gravity = normal_gravity(latitude_rad, height_m)
         C = np.eye(3) if C_ba is None else _checked("C_ba", C_ba, (3, 3))
-        self._constants = np.concatenate([C.ravel(), np.linalg.inv(C).ravel()])
+        self._constants = np.zeros(1, CONSTANTS)
+        self._constants["gravity_offset"] = 0.0 if gravity_m_s2 is None else gravity_m_s2 - gravity
+        self._constants["C_ba"], self._constants["a_b"] = C, np.linalg.inv(C)
+        self._matrices = None if C_ba is None else np.zeros(1, MATRICES)
         self._every = every
         self._samples = 0
-        self._state = np.zeros(_STATE)
-        self._state[_Q:_V] = q / np.linalg.norm(q)
-        self._state[_V:_PLACE] = _checked("velocity v_n", v_n, (3,))
-        self._state[_PLACE:_H] = place
-        self._state[_EARTH:] = latitude_rad, height_m
+        self._state = np.zeros(1, STATE)
+        self._state["q_nb"] = q / np.linalg.norm(q)
+        self._state["v_n"] = _checked("velocity v_n", v_n, (3,))
+        self._state["position"] = position
+        self._state["earth_at"] = latitude_rad, height_m
+
+    @classmethod
+    def from_site(
+        cls, site: Place, q_nb: ArrayLike, *, C_ba: ArrayLike | None = None, every: int = 1
+    ) -> Self:
+        """Start at rest at a site.
+
+        Parameters
+        ----------
+        site : Site
+            Position, and gravity if it was measured.
+        q_nb, C_ba, every
+            See the class.
+
+        Returns
+        -------
+        Navigator
+        """
+        position = site.latitude_rad, site.longitude_rad, site.height_m
+        return cls(*position, site.gravity_m_s2, q_nb, C_ba=C_ba, every=every)
 
     @property
     def latest(self) -> Records:
-        """One row, shape (1,): the newest state, with `counter`, `t_ns` and `flags` zero."""
-        row = np.zeros(1, MEASUREMENT if self._matrices else NAVIGATION)
-        words = _words(row)
-        words[0, _HEAD:] = self._state[: words.shape[1] - _HEAD]
+        """Current state as one row, shape (1,); its `counter`, `t_ns` and `flags` are zero."""
+        row = np.zeros(1, NAVIGATION if self._matrices is None else MEASUREMENT)
+        row["q_nb"], row["v_n"] = self._state["q_nb"], self._state["v_n"]
+        row["latitude_rad"], row["longitude_rad"], row["height_m"] = self._state["position"][0]
+        if self._matrices is not None:
+            for name in MATRICES.names or ():
+                row[name] = self._matrices[name]
         return row
 
     def feed(self, increments: Records) -> Records:
@@ -186,110 +261,115 @@ class Navigator:
         """
         if self._samples == 0 and len(increments):
             self._rest_before(increments["interval_ns"][0] * NS)
-        skip = -(self._samples + 1) % self._every  # rows before the first that is put out
-        told = increments[skip :: self._every]
-        out = np.empty(len(told), MEASUREMENT if self._matrices else NAVIGATION)
+        skip = -(self._samples + 1) % self._every  # samples before the first that makes a row
+        reported = increments[skip :: self._every]
+        out = np.empty(len(reported), NAVIGATION if self._matrices is None else MEASUREMENT)
         for name in ("counter", "t_ns", "flags"):
-            out[name] = told[name]
-        _navigate(
-            increments,
-            _words(out),
-            self._state,
-            self._constants,
-            self._gravity_offset,
-            self._matrices,
-            skip,
-            self._every,
-        )
+            out[name] = reported[name]
+        _navigate(increments, out, self._constants, self._state, self._matrices, skip, self._every)
         self._samples += len(increments)
         return out
 
     def _rest_before(self, T: float) -> None:
         """Fill in the two intervals before the first: the body rests on the Earth."""
-        s = self._state
-        q_bn = conjugate(tuple(s[_Q:_V].tolist()))
-        latitude, _, height = s[_PLACE:_H].tolist()
-        gravity = normal_gravity(latitude, height) + self._gravity_offset
+        s = self._state[0]
+        q_bn = conjugate(tuple(s["q_nb"].tolist()))
+        latitude, _, height = s["position"].tolist()
+        gravity = normal_gravity(latitude, height) + self._constants[0]["gravity_offset"]
         rate = turn(q_bn, earth_rate_n(latitude))
-        s[_T1], s[_T2], s[_OMEGA:_EARTH] = T, T, rate
-        s[_DTHETA1:_DV1] = s[_DTHETA2:_OMEGA] = scale(T, rate)
-        s[_DV1:_T2] = turn(q_bn, (0.0, 0.0, gravity * T))
+        s["T1"], s["T2"], s["omega1"] = T, T, rate
+        s["dtheta1"] = s["dtheta2"] = scale(T, rate)
+        s["dv1"] = turn(q_bn, (0.0, 0.0, gravity * T))
 
 
-def _checked(name: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
+def _checked(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
     array = np.array(value, np.float64)
     if array.shape != shape or not np.isfinite(array).all():
         raise InputError(f"navigation: expected {name} as finite numbers of shape {shape}, got {value!r}")
     return array
 
 
-def _words(rows: Records) -> NDArray[np.float64]:
-    """See the rows as a table of 8-byte words, in the same memory."""
-    return rows.view(np.float64).reshape(len(rows), rows.dtype.itemsize // 8)
+class _Motion(NamedTuple):
+    """Attitude, velocity and position."""
+
+    q_nb: Quaternion
+    v_n: Vector  # m/s
+    position: Vector  # latitude and longitude, rad, height, m
+
+
+class Gained(NamedTuple):
+    """Rotation and velocity of an interval."""
+
+    phi: Vector  # rotation vector, rad
+    dv_b: Vector  # m/s, body axes of the interval's beginning
 
 
 @kernel
 def _navigate(
     increments: Records,
-    out: NDArray[np.float64],
-    state: NDArray[np.float64],
-    constants: NDArray[np.float64],
-    gravity_offset: float,
-    matrices: bool,
+    out: Records,
+    constants: Records,
+    state: Records,
+    matrices: Records | None,
     skip: int,
     every: int,
 ) -> None:
-    """Step through `increments`; row `skip` and each `every` behind it go to `out`."""
-    q = (state[_Q], state[_Q + 1], state[_Q + 2], state[_Q + 3])
-    v, place = vector_at(state, _V), vector_at(state, _PLACE)
-    T1, dtheta1, dv1 = state[_T1], vector_at(state, _DTHETA1), vector_at(state, _DV1)
-    T2, dtheta2, omega = state[_T2], vector_at(state, _DTHETA2), vector_at(state, _OMEGA)
+    """Step through `increments`; row `skip` and every `every`-th after it go to `out`.
+
+    numba compiles a version of its own for `matrices` None, in which their code does not exist.
+    """
+    c, s = constants[0], state[0]
+    now = _Motion(quaternion_at(s["q_nb"]), vector_at(s["v_n"], 0), vector_at(s["position"], 0))
+    T1, dtheta1, dv1 = s["T1"], vector_at(s["dtheta1"], 0), vector_at(s["dv1"], 0)
+    T2, dtheta2, omega1 = s["T2"], vector_at(s["dtheta2"], 0), vector_at(s["omega1"], 0)
     weights, T_weights = (0.0, 0.0, 0.0), 0.0
-    at_latitude, at_height = state[_EARTH], state[_EARTH + 1]
-    earth = _earth(at_latitude, at_height)
+    latitude, height = s["earth_at"][0], s["earth_at"][1]
+    earth = _earth(latitude, height, c["gravity_offset"])
     filled = 0
     for i in range(increments.shape[0]):
         sample = increments[i]
         T = sample["interval_ns"] * NS
+        # element by element: a helper for three costs 2 ns per sample
         dtheta = (sample["dtheta_b"][0], sample["dtheta_b"][1], sample["dtheta_b"][2])
         dv = (sample["dv_b"][0], sample["dv_b"][1], sample["dv_b"][2])
-        phi, dv_b = body_step(T, dtheta, dv, T1, dtheta1, dv1)
-        if abs(place[0] - at_latitude) * SEMI_MAJOR_AXIS > NEAR or abs(place[2] - at_height) > NEAR:
-            at_latitude, at_height = place[0], place[2]
-            earth = _earth(at_latitude, at_height)
-        q1, v, place = _step(q, v, place, T, phi, dv_b, earth, gravity_offset)
-        if matrices:
+        before = now
+        gained = body_step(T, dtheta, dv, T1, dtheta1, dv1)
+        if _is_far(now.position, latitude, height):
+            latitude, height = now.position[0], now.position[2]
+            earth = _earth(latitude, height, c["gravity_offset"])
+        now = _step(before, T, gained, earth)
+        if matrices is not None:
             if not T == T1 == T2 == T_weights:
                 weights, T_weights = _end_rate_weights(T, T1, T2), T if T == T1 == T2 else 0.0
             latest = add(scale(weights[0], dtheta), scale(weights[1], dtheta1))
-            omega1 = add(latest, scale(weights[2], dtheta2))
-            _measure(state, constants, q, q1, earth.omega_ie, T, dtheta, omega, omega1)
-            T2, dtheta2, omega = T1, dtheta1, omega1
-        q, T1, dtheta1, dv1 = q1, T, dtheta, dv
+            omega = add(latest, scale(weights[2], dtheta2))
+            Omega = _omega_increment(T, dtheta, omega1, omega)
+            _measure(matrices[0], c, _halfway(before.q_nb, now.q_nb), Omega, earth.omega_ie, T, dtheta)
+            T2, dtheta2, omega1 = T1, dtheta1, omega
+        T1, dtheta1, dv1 = T, dtheta, dv
         if i == skip:
-            skip += every
-            out[filled, 3], out[filled, 4], out[filled, 5], out[filled, 6] = q
-            out[filled, 7], out[filled, 8], out[filled, 9] = v
-            out[filled, 10], out[filled, 11], out[filled, 12] = place
-            if matrices:
-                for k in range(_H, _T1):
-                    out[filled, _HEAD + k] = state[k]
+            row = out[filled]
+            put_quaternion(row["q_nb"], now.q_nb)
+            put(row["v_n"], 0, now.v_n)
+            row["latitude_rad"], row["longitude_rad"], row["height_m"] = now.position
+            if matrices is not None:
+                row["H"], row["B"] = matrices[0]["H"], matrices[0]["B"]
+                row["P"], row["Q"] = matrices[0]["P"], matrices[0]["Q"]
             filled += 1
-    state[_Q], state[_Q + 1], state[_Q + 2], state[_Q + 3] = q
-    put(state, _V, v)
-    put(state, _PLACE, place)
-    state[_T1], state[_T2] = T1, T2
-    put(state, _DTHETA1, dtheta1)
-    put(state, _DV1, dv1)
-    put(state, _DTHETA2, dtheta2)
-    put(state, _OMEGA, omega)
-    state[_EARTH], state[_EARTH + 1] = at_latitude, at_height
+            skip += every
+    put_quaternion(s["q_nb"], now.q_nb)
+    put(s["v_n"], 0, now.v_n)
+    put(s["position"], 0, now.position)
+    s["T1"], s["T2"] = T1, T2
+    put(s["dtheta1"], 0, dtheta1)
+    put(s["dv1"], 0, dv1)
+    put(s["dtheta2"], 0, dtheta2)
+    put(s["omega1"], 0, omega1)
+    s["earth_at"][0], s["earth_at"][1] = latitude, height
 
 
 @kernel
-def body_step(
-    T: float, dtheta: Vector, dv: Vector, T1: float, dtheta1: Vector, dv1: Vector
-) -> tuple[Vector, Vector]:
+def body_step(T: float, dtheta: Vector, dv: Vector, T1: float, dtheta1: Vector, dv1: Vector) -> Gained:
     """Rotation and velocity of an interval, with coning, sculling and rotation.
 
     Parameters
@@ -301,41 +381,40 @@ def body_step(
 
     Returns
     -------
-    tuple of 2 tuples of 3 float
-        Rotation vector, rad, and velocity gained, m/s, in the body axes of the interval's beginning.
+    Gained
     """
     k = T * T / (6.0 * T1 * (T1 + T))
     phi = add(dtheta, scale(k, cross(dtheta1, dtheta)))
     sculling = add(cross(dtheta1, dv), cross(dv1, dtheta))
     dv = add(dv, scale(k, sculling))
     x = dot(dtheta, dtheta)
-    if x < 0.01:  # as series, the first term left out under 1e-13
+    if x < 0.01:  # series; the first term left out is below 1e-13
         c1 = 1 / 2 + x * (-1 / 24 + x * (1 / 720 + x * (-1 / 40320)))
         c2 = 1 / 6 + x * (-1 / 120 + x * (1 / 5040 + x * (-1 / 362880)))
     else:
         angle = sqrt(x)
         c1, c2 = (1.0 - cos(angle)) / x, (1.0 - sin(angle) / angle) / x
     turned = cross(dtheta, dv)
-    return phi, add(dv, add(scale(c1, turned), scale(c2, cross(dtheta, turned))))
+    return Gained(phi, add(dv, add(scale(c1, turned), scale(c2, cross(dtheta, turned)))))
 
 
 class _Earth(NamedTuple):
     omega_ie: Vector  # rad/s
-    gravity: float  # normal, m/s^2
-    per_north: float  # rad of latitude a metre to the north
-    per_east: float  # rad of turn about the meridian a metre to the east
+    gravity: float  # m/s^2
+    per_north: float  # rad of latitude per metre to the north
+    per_east: float  # rad of rotation about the meridian per metre to the east
     secant: float  # of the latitude
     tangent: float
 
 
 @kernel
-def _earth(latitude: float, height: float) -> _Earth:
-    """Terms of the Earth that change with the place."""
+def _earth(latitude: float, height: float, gravity_offset: float) -> _Earth:
+    """Terms of the Earth that depend on the position."""
     meridian, prime_vertical = radii(latitude)
     secant = 1.0 / cos(latitude)
     return _Earth(
         earth_rate_n(latitude),
-        normal_gravity(latitude, height),
+        normal_gravity(latitude, height) + gravity_offset,
         1.0 / (meridian + height),
         1.0 / (prime_vertical + height),
         secant,
@@ -344,20 +423,18 @@ def _earth(latitude: float, height: float) -> _Earth:
 
 
 @kernel
-def _step(
-    q: Quaternion,
-    v: Vector,
-    place: Vector,
-    T: float,
-    phi: Vector,
-    dv_b: Vector,
-    earth: _Earth,
-    gravity_offset: float,
-) -> tuple[Quaternion, Vector, Vector]:
-    """Attitude, velocity and place after an interval."""
-    gravity = (0.0, 0.0, -(earth.gravity + gravity_offset) * T)
+def _is_far(position: Vector, latitude: float, height: float) -> bool:
+    """Whether the Earth's terms of that latitude and height no longer serve."""
+    return abs(position[0] - latitude) * SEMI_MAJOR_AXIS > NEAR or abs(position[2] - height) > NEAR
 
-    dv_n = turn(q, dv_b)
+
+@kernel
+def _step(before: _Motion, T: float, gained: Gained, earth: _Earth) -> _Motion:
+    """Attitude, velocity and position after an interval."""
+    q, v, (latitude, longitude, height) = before.q_nb, before.v_n, before.position
+    gravity = (0.0, 0.0, -earth.gravity * T)
+
+    dv_n = turn(q, gained.dv_b)
     middle = add(v, scale(0.5, add(dv_n, gravity)))
     east = middle[0] * earth.per_east
     omega_en = (-middle[1] * earth.per_north, east, east * earth.tangent)
@@ -369,14 +446,12 @@ def _step(
 
     mean = scale(0.5 * T, add(v, v1))
     north_rad = mean[1] * earth.per_north
-    # the meridians draw together on the way: cosine of the middle latitude, to first order
+    # the meridians converge on the way: cosine of the middle latitude, to first order
     east_rad = mean[0] * earth.per_east * earth.secant * (1.0 + 0.5 * earth.tangent * north_rad)
-    latitude, longitude, height = place
-    place1 = (latitude + north_rad, longitude + east_rad, height + mean[2])
-    # zeta, 7e-5 rad a second, to second order: `unit` brings what is left out of the cosine
+    position = latitude + north_rad, longitude + east_rad, height + mean[2]
+    # zeta, 7e-5 rad a second, to second order: `unit` restores what the cosine lacks
     q_zeta = (1.0, -0.5 * zeta[0], -0.5 * zeta[1], -0.5 * zeta[2])
-    q1 = unit(product(q_zeta, product(q, quaternion_of_vector(phi))))
-    return q1, v1, place1
+    return _Motion(unit(product(q_zeta, product(q, quaternion_of_vector(gained.phi)))), v1, position)
 
 
 @kernel
@@ -393,75 +468,61 @@ def _end_rate_weights(T: float, T1: float, T2: float) -> Vector:
 
 
 @kernel
-def _measure(
-    state: NDArray[np.float64],
-    constants: NDArray[np.float64],
-    q: Quaternion,
-    q1: Quaternion,
-    omega_ie: Vector,
-    T: float,
-    dtheta: Vector,
-    w0: Vector,
-    w1: Vector,
-) -> None:
-    """Take H, B, P and Q through an interval from attitude q to q1; w0 and w1 are the rates at its ends."""
-    # The sum of two near unit quaternions lies half-way between them.
-    C = rows_of((q[0] + q1[0], q[1] + q1[1], q[2] + q1[2], q[3] + q1[3]))
-    Omega = _omega_increment(T, dtheta, w0, w1)
-    zeta = scale(2.0 * T, omega_ie)  # without an east component
-    _gain_columns(state, constants, 0, C, Omega, zeta)
-    _gain_columns(state, constants, 1, C, Omega, zeta)
-    _gain_columns(state, constants, 2, C, Omega, zeta)
-    _gain_row(state, 0, T, C[0], dtheta)
-    _gain_row(state, 1, T, C[1], dtheta)
-    _gain_row(state, 2, T, C[2], dtheta)
+def _halfway(q: Quaternion, q1: Quaternion) -> Matrix:
+    """Rotation matrix half-way between two close attitudes: the sum of their quaternions lies there."""
+    return rows_of((q[0] + q1[0], q[1] + q1[1], q[2] + q1[2], q[3] + q1[3]))
 
 
 @kernel
-def _gain_columns(
-    state: NDArray[np.float64],
-    constants: NDArray[np.float64],
-    i: int,
-    C: tuple[Vector, Vector, Vector],
-    Omega: tuple[Vector, Vector, Vector],
-    zeta: Vector,
+def _measure(
+    m: np.void, c: np.void, C_nb: Matrix, Omega: Matrix, omega_ie: Vector, T: float, dtheta: Vector
 ) -> None:
-    """Columns of H of accelerometer i: add `C_nb c_i a_i^T Omega`, take off `zeta x` the columns."""
-    a = vector_at(constants, 9 + 3 * i)
-    felt = add(scale(a[0], Omega[0]), add(scale(a[1], Omega[1]), scale(a[2], Omega[2])))
-    c = (constants[i], constants[3 + i], constants[6 + i])
-    at = _H + 3 * i
-    east, north, up = vector_at(state, at), vector_at(state, at + 9), vector_at(state, at + 18)
+    """Take H, B, P and Q through an interval; `C_nb` is the attitude in its middle."""
+    zeta = scale(2.0 * T, omega_ie)  # without an east component
+    for i in range(3):
+        _gain_columns(m["H"], i, c, C_nb, Omega, zeta)
+    half = scale(0.5, dtheta)
+    _gain_rows(m, 0, T, C_nb[0], half)
+    _gain_rows(m, 1, T, C_nb[1], half)
+    _gain_rows(m, 2, T, C_nb[2], half)
+
+
+@kernel
+def _gain_columns(H: Array, i: int, c: np.void, C_nb: Matrix, Omega: Matrix, zeta: Vector) -> None:
+    """Columns of H of accelerometer i: add `C_nb c_i a_i^T Omega`, subtract `zeta x` the columns."""
+    a = vector_at(c["a_b"][i], 0)
+    sensed = add(scale(a[0], Omega[0]), add(scale(a[1], Omega[1]), scale(a[2], Omega[2])))
+    C_ba = c["C_ba"]
+    column = C_ba[0, i], C_ba[1, i], C_ba[2, i]
+    east, north, up = vector_at(H[0], 3 * i), vector_at(H[1], 3 * i), vector_at(H[2], 3 * i)
     north1 = subtract(north, scale(zeta[2], east))
     up1 = add(up, scale(zeta[1], east))
     east1 = add(east, subtract(scale(zeta[2], north), scale(zeta[1], up)))
-    put(state, at, add(east1, scale(dot(C[0], c), felt)))
-    put(state, at + 9, add(north1, scale(dot(C[1], c), felt)))
-    put(state, at + 18, add(up1, scale(dot(C[2], c), felt)))
+    put(H[0], 3 * i, add(east1, scale(dot(C_nb[0], column), sensed)))
+    put(H[1], 3 * i, add(north1, scale(dot(C_nb[1], column), sensed)))
+    put(H[2], 3 * i, add(up1, scale(dot(C_nb[2], column), sensed)))
 
 
 @kernel
-def _gain_row(state: NDArray[np.float64], n: int, T: float, c: Vector, dtheta: Vector) -> None:
-    """Row n of B, P and Q; c is that row of C_nb."""
-    at = _B + 3 * n
-    put(state, at, add(vector_at(state, at), scale(T, c)))
-    half = scale(0.5, dtheta)
-    _gain_angle(state, 9 * n, T, scale(c[0], half))
-    _gain_angle(state, 9 * n + 3, T, scale(c[1], half))
-    _gain_angle(state, 9 * n + 6, T, scale(c[2], half))
+def _gain_rows(m: np.void, n: int, T: float, c: Vector, half: Vector) -> None:
+    """Row n of B, P and Q; c is that row of C_nb, half of dtheta."""
+    B, P, Q = m["B"][n], m["P"][n], m["Q"][n]
+    put(B, 0, add(vector_at(B, 0), scale(T, c)))
+    _gain_angle(P, Q, 0, T, scale(c[0], half))
+    _gain_angle(P, Q, 3, T, scale(c[1], half))
+    _gain_angle(P, Q, 6, T, scale(c[2], half))
 
 
 @kernel
-def _gain_angle(state: NDArray[np.float64], at: int, T: float, half: Vector) -> None:
-    """Three elements of P, and of its integral by the trapezoidal rule; half of what P gains."""
-    P, Q = vector_at(state, _P + at), vector_at(state, _IP + at)
-    middle = add(P, half)
-    put(state, _IP + at, add(Q, scale(T, middle)))
-    put(state, _P + at, add(middle, half))
+def _gain_angle(P: Array, Q: Array, at: int, T: float, half: Vector) -> None:
+    """Three elements of P, and of its integral Q by the trapezoidal rule; `half` of what P gains."""
+    middle = add(vector_at(P, at), half)
+    put(Q, at, add(vector_at(Q, at), scale(T, middle)))
+    put(P, at, add(middle, half))
 
 
 @kernel
-def _omega_increment(T: float, dtheta: Vector, w0: Vector, w1: Vector) -> tuple[Vector, Vector, Vector]:
+def _omega_increment(T: float, dtheta: Vector, w0: Vector, w1: Vector) -> Matrix:
     """Rows of the integral of Omega over an interval (mathematics, section 1).
 
     `[(w1 - w0) x] + T / 6 ([w0 x]^2 + 4 [wm x]^2 + [w1 x]^2)`, wm = dtheta / T; `[w x]^2 = w w^T - w^2 I`.

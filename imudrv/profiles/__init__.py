@@ -1,6 +1,6 @@
-"""Profiles: a unit's wire format as data. Four ship with the package; a user's own is read by path.
+"""Profiles: a unit's wire format as data. Four come with the package; a user's own is read by path.
 
-A profile is checked whole before anything uses it, and becomes a `Layout` for the decoder.
+A profile is checked completely before it is used, and becomes a `Layout` for the decoder.
 """
 
 from collections.abc import Iterator
@@ -33,7 +33,7 @@ _CAN_FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 
 
 class Number(Model):
-    """One number of a message: what it is, its type, where it begins and, where it has one, its axis."""
+    """One number of a message: its meaning, type, offset and, if it has one, its axis."""
 
     name: Literal["counter", "gyro", "accelerometer", "status", "temperature"]
     type: NumberType
@@ -58,7 +58,7 @@ class Number(Model):
 
     @property
     def bits(self) -> int:
-        """Width."""
+        """Width, bits."""
         return int(self.type[1:])
 
 
@@ -70,7 +70,7 @@ class Constant(Model):
 
 
 class Check(Model):
-    """CRC or sum over the bytes `first` to `last`, both included; it stands at `offset`."""
+    """CRC or sum over the bytes `first` to `last`, both included; its value is at `offset`."""
 
     kind: Literal["crc", "sum"]
     width: Literal[8, 16, 32]
@@ -149,7 +149,7 @@ class CanLine(Model):
 
 
 class StatusBit(Model):
-    """A bit of the status word: its name for people and what it means for the samples."""
+    """A bit of the status word: its name for people and its meaning for the samples."""
 
     bit: Annotated[int, Key(ge=0, le=31)]
     name: Annotated[str, Key(min_length=1, max_length=64)]
@@ -157,7 +157,7 @@ class StatusBit(Model):
 
 
 class Nominal(Model):
-    """Scale factors of the type, for looking at uncalibrated data."""
+    """Nominal scale factors of the type of unit, for uncalibrated data."""
 
     gyro_arcsec_per_pulse: Annotated[float, Key(gt=0)]
     accelerometer_pulse_per_m_s: Annotated[float, Key(gt=0)]
@@ -175,7 +175,7 @@ class Profile(Model):
     byte_order: Literal["little", "big"]
     counts: Literal["increment", "total"]
     nominal: Nominal
-    messages: Annotated[tuple[Message, ...], Key(min_length=1, max_length=16)]
+    messages: Annotated[tuple[Message, ...], Key(min_length=1, max_length=wire.MAX_MESSAGES)]
     status_bits: Annotated[tuple[StatusBit, ...], Key(max_length=32)] = ()
 
     @field_validator("status_bits")
@@ -247,7 +247,7 @@ class Profile(Model):
         if len({n.bits for n in always if n.name == "counter"}) > 1:
             faults.append("counter: expected one width in the messages of every sample, got several")
         if sum(n.name == "status" for n in everywhere) > 1:
-            faults.append("status: expected one field at the most, got several")
+            faults.append("status: expected at most one field, got several")
         sensors = [n.sensor for n in everywhere if n.name == "temperature"]
         if len(set(sensors)) < len(sensors) or len(sensors) > MAX_TEMPERATURES:
             faults.append(f"temperature: expected up to {MAX_TEMPERATURES}, each sensor once, got {sensors}")
@@ -255,12 +255,12 @@ class Profile(Model):
 
     @property
     def fd(self) -> bool:
-        """CAN FD."""
+        """Whether the messages are CAN FD."""
         return isinstance(self.line, CanLine) and self.line.data_bitrate is not None
 
     @property
     def transmission_ns(self) -> int:
-        """Time that the messages of a sample take on the line, ns; on CAN without stuffing and waiting."""
+        """Transmission time of the messages of a sample, ns; on CAN without stuffing and arbitration."""
         lengths = [m.length for m in self.messages if m.every == 1]
         if isinstance(self.line, SerialLine):
             bits_a_byte = 1 + self.line.bytesize + (self.line.parity != "none") + self.line.stopbits
@@ -335,14 +335,14 @@ def _check(check: Check | None) -> wire.Check:
 
 
 def shipped() -> list[str]:
-    """Names of the profiles that come with the package."""
+    """Return the names of the profiles that come with the package."""
     return sorted(
         p.name.removesuffix(".yaml") for p in resources.files(__name__).iterdir() if p.name.endswith(".yaml")
     )
 
 
 def load(name_or_path: str) -> Profile:
-    """A profile, by the name of a shipped one or by the path of a file.
+    """Read a profile, by the name of a shipped one or by the path of a file.
 
     Parameters
     ----------
@@ -364,7 +364,7 @@ def load(name_or_path: str) -> Profile:
 
 
 def content(name_or_path: str) -> bytes:
-    """A profile's file, as it is; see `load`."""
+    """Content of a profile's file; see `load`."""
     with _file(name_or_path) as path:
         return path.read_bytes()
 

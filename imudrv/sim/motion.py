@@ -23,18 +23,17 @@ Left out: the change of gravity over the arm and the way, 3.1e-6 / s^2 (0.03 ug 
 """
 
 from math import ceil, cos, exp, floor, lgamma, log, pi, radians, sin
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from imudrv.arrays import Array
 from imudrv.kernels import kernel
-from imudrv.nav.attitude import rotate, rotation
+from imudrv.nav.attitude import rotate_about, rotation
 from imudrv.sim.scenario import Rest, Rock, Rotate, Scenario, Start, Vibrate, intervals
 from imudrv.units import DEG, MM, NS, STANDARD_GRAVITY
 from imudrv.vectors import Vector, add, cross, dot, row, scale
-
-Array: TypeAlias = NDArray[np.float64]
 
 SINUSOIDS = 32
 """Sinusoids in a random motion."""
@@ -539,7 +538,7 @@ def _into_b(v_n: Vector, segment: _Segment, turn: _Turn) -> Vector:
         scale(v_n[2], row(segment.C_nb, 2)),
     )
     for r in range(3):
-        v_b = rotate(v_b, row(segment.axes_b, r), turn.cosine[r], -turn.sine[r])
+        v_b = rotate_about(v_b, row(segment.axes_b, r), turn.cosine[r], -turn.sine[r])
     return add(v_b, cross(v_b, turn.case))
 
 
@@ -549,8 +548,8 @@ def _rates(segment: _Segment, body: Body, turn: _Turn, v: Array, a: Array, j: in
     omega, omega_dot = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     for r in range(3):
         u = row(segment.axes_b, r)
-        before = rotate(omega, u, turn.cosine[r], -turn.sine[r])
-        omega_dot = rotate(omega_dot, u, turn.cosine[r], -turn.sine[r])
+        before = rotate_about(omega, u, turn.cosine[r], -turn.sine[r])
+        omega_dot = rotate_about(omega_dot, u, turn.cosine[r], -turn.sine[r])
         omega_dot = add(omega_dot, add(scale(a[r, j], u), scale(v[r, j], cross(before, u))))
         omega = add(before, scale(v[r, j], u))
     omega_dot = add(omega_dot, add(cross(omega_dot, turn.case), cross(omega, turn.case_rate)))

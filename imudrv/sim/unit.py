@@ -18,11 +18,12 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from imudrv.arrays import Array
 from imudrv.errors import InputError
 from imudrv.kernels import kernel
-from imudrv.nav.earth import earth_rate_n, normal_gravity
+from imudrv.nav.earth import earth_rate_n
 from imudrv.records import PULSES, Records
-from imudrv.sim.motion import Array, Body, Dithering, Integrals, Motion, cycles_at, split_cycles
+from imudrv.sim.motion import Body, Dithering, Integrals, Motion, cycles_at, split_cycles
 from imudrv.sim.scenario import NOMINAL, Dither, Faults, Scenario
 from imudrv.units import ARCSEC, DEG_PER_H, DEG_PER_SQRT_H, MM, NS, PPM, UG, URAD
 from imudrv.vectors import Vector, dot, row
@@ -240,16 +241,11 @@ def _inverse(matrix: Array) -> Array:
 
 def _body(scenario: Scenario, truth: TrueUnit, interval_s: float) -> Body:
     site = scenario.site
-    gravity = (
-        site.gravity_m_s2
-        if site.gravity_m_s2 is not None
-        else normal_gravity(site.latitude_rad, site.height_m)
-    )
     x, y, z = (MM * offset for offset in scenario.start.pivot_offset_mm)
     dither = scenario.unit.dither
     return Body(
         interval_s=interval_s,
-        gravity=gravity,
+        gravity=site.gravity,
         omega_ie_n=earth_rate_n(site.latitude_rad),
         pivot_to_origin_b=(x, y, z),
         A=_inverse(truth.C_ba),

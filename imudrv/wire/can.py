@@ -1,52 +1,88 @@
-"""CAN messages to frames: puts the messages of one sample together and finds its full counter."""
+"""CAN messages to frames: joins the messages of one sample and determines its full counter."""
 
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from imudrv.kernels import kernel
 from imudrv.records import FRAME, MAX_TEMPERATURES, NO_TEMPERATURE, REJECT, Reason, Records
-from imudrv.wire.fields import SLACK, ahead_of, check_holds, fill, read
-from imudrv.wire.layout import COUNTER, Layout
+from imudrv.wire.fields import SLACK, Bytes, ahead_of, check_holds, fill, read
+from imudrv.wire.layout import MAX_MESSAGES, Layout
 from imudrv.wire.stream import Decoded
-from imudrv.wire.tables import message_tables
+from imudrv.wire.tables import Tables, layout_tables
 
 OPEN_SAMPLES: Final = 4
 """Incomplete samples kept at a time: the order of ids may interleave neighbours."""
 LATE: Final = 64
-"""A message up to this many samples behind the newest one is doubled; farther, the unit has restarted."""
+"""A message at most this many samples before the newest is a duplicate; if older, the unit has restarted."""
+
+_MAX_LENGTH: Final = 64
+_ROOM: Final = _MAX_LENGTH + SLACK
+
+CONSTANTS: Final = np.dtype(
+    [
+        ("all_parts", np.int64),  # one bit for each kind that comes with every sample
+        ("low_bits", np.int64),  # of the counter in these
+        ("full_bits", np.int64),  # of the widest counter
+        ("hold", np.int64),  # samples to wait for a full counter
+    ],
+    align=True,
+)
+"""Constants of a layout, beside its tables."""
+
+SLOT: Final = np.dtype(
+    [
+        ("parts", np.int64),  # one bit for each kind that has come; 0: the slot is free
+        ("begun", np.int64),  # index of the first message
+        ("low", np.int64),  # low bits of the counter
+        ("index", np.int64, MAX_MESSAGES),  # of the message of each kind
+        ("data", np.uint8, (MAX_MESSAGES, _ROOM)),
+    ],
+    align=True,
+)
+"""An incomplete sample."""
+
+STATE: Final = np.dtype(
+    [
+        ("index", np.int64),  # of the next message
+        ("foreign", np.int64),  # counts since the beginning
+        ("slow", np.int64),
+        ("disagreements", np.int64),
+        ("counter", np.int64),  # of the newest sample
+        ("has_sample", np.bool_),
+        ("is_anchored", np.bool_),  # the upper bits of the counter are known
+        ("damaged", np.int64),  # messages since the frame before
+        ("torn", np.int64),  # samples given up since the frame before
+        ("latest", FRAME),  # status and temperatures that hold for the next sample
+        ("released", np.int64),  # counts of the running call: frames that may go out,
+        ("found", np.int64),  # these and the held ones,
+        ("rejected", np.int64),  # rejects
+    ],
+    align=True,
+)
+"""State that a call of the kernels leaves to the next."""
 
 _NO_FRAMES: Final = np.zeros(0, FRAME)
 _NO_REJECTS: Final = np.zeros(0, REJECT)
-_LONGEST: Final = 64
-_ROOM: Final = _LONGEST + SLACK
+_SOUND: Final = 0
 _WRONG_LENGTH: Final = int(Reason.WRONG_LENGTH)
 _CHECK_FAILED: Final = int(Reason.CHECK_FAILED)
 _TORN: Final = int(Reason.TORN)
 _STALE: Final = int(Reason.STALE)
 
-_ID, _LENGTH, _COUNTER_AT, _IS_PART, _IS_FULL, _FIELD, _CONSTANT = range(7)
-"""Columns of the table of kinds; the last two: where its rows begin in the tables of fields and constants."""
-
-_INDEX, _FOREIGN, _SLOW, _DISAGREED, _COUNTER, _HAS_SAMPLE, _IS_ANCHORED, _DAMAGED, _GIVEN_UP = range(9)
-"""State: index of the next message; counts of messages and disagreements; counter of the newest sample,
-whether one has come, whether its upper bits are settled; since the frame before: damaged messages, samples
-given up."""
-
 
 class CanAssembler:
-    """Assembler of a CAN profile's samples; feed it messages as they come, in any pieces.
+    """Assembler of a CAN profile's samples; feed it messages as they arrive, in any pieces.
 
-    A sample is complete when all messages that come with every sample have come with the same counter. The
-    incomplete ones before it are then given up: their messages are `TORN`. A second message of the same kind
-    and counter, or one for a sample up to `LATE` behind the newest, is `STALE`. A counter farther behind
-    means that the unit has restarted, and what is known of it is forgotten.
+    A sample is complete when all messages that come with every sample have come with the same counter. Older
+    incomplete samples are then given up: their messages are `TORN`. A second message of the same kind and
+    counter, or one for a sample at most `LATE` before the newest, is `STALE`. An older counter means that the
+    unit has restarted, and its former state is forgotten.
 
-    Messages that come with each k-th sample only (temperatures, status, full counter) hold from then on;
-    temperatures are `NO_TEMPERATURE` before. Where such a message has a wider counter than the samples, they
-    are held until the first one tells their full counter, 2 k samples at the most; if none comes they go out
-    counted on from the first one's own counter. A later one that says otherwise is believed from then on.
+    Messages that come with every k-th sample only (temperatures, status, full counter) hold from then on;
+    temperatures are `NO_TEMPERATURE` before. If such a message has a wider counter than the samples, these
+    are held until the first one gives their full counter, at most 2 k samples; without one they are released
+    with counters that continue the first one's own. A later full counter that disagrees is used from then on.
 
     The frames and rejects are the same for any cut into pieces, and every message fed is part of a frame, a
     reject, `slow`, `foreign` or `pending`. It does not matter whether a message was CAN FD: identifier,
@@ -55,47 +91,43 @@ class CanAssembler:
     Parameters
     ----------
     layout : Layout
-        Of a CAN profile.
+        Layout of a CAN profile.
     """
 
     def __init__(self, layout: Layout) -> None:
-        kinds = layout.messages
-        self._tables = _tables(layout)
-        self._parts = sum(kind.every == 1 for kind in kinds)
-        self._begun = np.zeros(OPEN_SAMPLES, np.int64)
-        self._have = np.zeros(OPEN_SAMPLES, np.int64)
-        self._low = np.zeros(OPEN_SAMPLES, np.int64)
-        self._index = np.zeros((OPEN_SAMPLES, len(kinds)), np.int64)
-        self._data = np.zeros((OPEN_SAMPLES, len(kinds), _ROOM), np.uint8)
+        self._tables = layout_tables(layout)
+        self._constants = _constants(layout, self._tables[0])
+        self._parts = sum(kind.every == 1 for kind in layout.messages)
+        self._slots = np.zeros(OPEN_SAMPLES, SLOT)
         self._held = _NO_FRAMES
-        self._latest = np.zeros(1, FRAME)
-        self._state = np.zeros(9, np.int64)
-        _forget(self._state, self._latest, self._tables.hold)
+        self._state = np.zeros(1, STATE)
+        _forget(self._constants[0], self._state[0])
 
     @property
     def messages_fed(self) -> int:
         """Messages fed since the beginning."""
-        return int(self._state[_INDEX])
+        return int(self._state[0]["index"])
 
     @property
     def foreign(self) -> int:
         """Messages with identifiers that the profile does not know; a busy bus would flood the rejects."""
-        return int(self._state[_FOREIGN])
+        return int(self._state[0]["foreign"])
 
     @property
     def slow(self) -> int:
         """Accepted messages of the kinds that do not come with every sample."""
-        return int(self._state[_SLOW])
+        return int(self._state[0]["slow"])
 
     @property
     def pending(self) -> int:
         """Messages of samples that are incomplete or held."""
-        return sum(int(have).bit_count() for have in self._have) + self._held.size * self._parts
+        incomplete = sum(int(parts).bit_count() for parts in self._slots["parts"])
+        return incomplete + self._held.size * self._parts
 
     @property
     def counter_disagreements(self) -> int:
-        """How often a full counter was not the one expected."""
-        return int(self._state[_DISAGREED])
+        """Number of full counters that were not the expected ones."""
+        return int(self._state[0]["disagreements"])
 
     def feed(self, messages: Records) -> Decoded:
         """Take messages in.
@@ -108,257 +140,270 @@ class CanAssembler:
         Returns
         -------
         Decoded
-            What became complete with them. `offset` of a frame is the index of the message that completed it,
-            `t_ns` that message's; `offset` of a reject is the index of the message, `length` 1. Indices count
-            all messages ever fed.
+            Frames and rejects that they complete. `offset` of a frame is the index of the message that
+            completed it, `t_ns` that message's time; `offset` of a reject is the index of the message,
+            `length` 1. Indices count all messages ever fed.
         """
         held = self._held.size
         frames = np.zeros(held + messages.size, FRAME)
         frames[:held] = self._held
-        rejects = np.zeros((messages.size + OPEN_SAMPLES * self._parts, 3), np.int64)
+        rejects = np.zeros(messages.size + OPEN_SAMPLES * self._parts, REJECT)
         released, found, rejected = _assemble(
-            messages,
-            self._tables,
-            (self._begun, self._have, self._low, self._index, self._data),
-            self._latest,
-            self._state,
-            frames,
-            held,
-            rejects,
+            messages, self._tables, self._constants, self._slots, self._state, frames, held, rejects
         )
         # Copies and views of nothing would take a quarter of a live call.
         self._held = frames[released:found].copy() if released < found else _NO_FRAMES
-        refused = rejects[:rejected].view(REJECT)[:, 0] if rejected else _NO_REJECTS
-        return Decoded(frames[:released], refused)
+        return Decoded(frames[:released], rejects[:rejected] if rejected else _NO_REJECTS)
 
     def close(self) -> Decoded:
-        """End of the messages: held samples come out, incomplete ones as rejects."""
+        """End of the messages.
+
+        Returns
+        -------
+        Decoded
+            The samples that were held, and the messages of incomplete ones as rejects.
+        """
         torn = [
             (index, 1, Reason.TORN)
-            for slot in np.argsort(self._begun)
-            for kind, index in enumerate(self._index[slot])
-            if self._have[slot] >> kind & 1
+            for slot in self._slots[np.argsort(self._slots["begun"])]
+            for kind, index in enumerate(slot["index"].tolist())
+            if slot["parts"] >> kind & 1
         ]
-        self._have[:] = 0
-        frames, self._held = self._held, self._held[:0]
+        self._slots["parts"] = 0
+        frames, self._held = self._held, _NO_FRAMES
         return Decoded(frames, np.array(torn, REJECT))
 
 
-class _Tables(NamedTuple):
-    """What the kernel reads of a layout; the rows of all kinds are stacked."""
-
-    kinds: NDArray[np.int64]
-    big_endian: bool
-    fields: NDArray[np.int64]
-    constants: NDArray[np.int64]
-    checks: NDArray[np.int64]
-    crc_tables: NDArray[np.uint32]
-    whole: int  # one bit for each kind that is part of every sample
-    low_bits: int
-    full_bits: int
-    hold: int  # samples to wait for a full counter
-
-
-def _tables(layout: Layout) -> _Tables:
-    kinds = layout.messages
-    counters = [next((f for f in kind.fields if f.target == COUNTER), None) for kind in kinds]
-    low_bits = next(f.bits for f, kind in zip(counters, kinds, strict=True) if f and kind.every == 1)
-    rows: list[tuple[int, ...]] = []
-    field = constant = hold = 0
-    for kind, counter in zip(kinds, counters, strict=True):
-        is_full = kind.every > 1 and counter is not None and counter.bits > low_bits
-        at = counter.offset if counter else 0
-        rows.append((kind.can_id, kind.length, at, kind.every == 1, is_full, field, constant))
-        field += len(kind.fields)
-        constant += len(kind.constants)
-        hold = max(hold, 2 * kind.every * is_full)
-    rows.append((-1, 0, 0, 0, 0, field, constant))
-    tables = [message_tables(layout, kind) for kind in kinds]
-    return _Tables(
-        np.array(rows, np.int64),
-        layout.big_endian,
-        np.concatenate([t.fields for t in tables]),
-        np.concatenate([t.constants for t in tables]),
-        np.stack([t.check for t in tables]),
-        np.stack([t.crc_table for t in tables]),
-        sum(1 << k for k, kind in enumerate(kinds) if kind.every == 1),
-        low_bits,
-        max(f.bits for f in counters if f),
-        hold,
-    )
+def _constants(layout: Layout, kinds: Records) -> Records:
+    parts, every = kinds["in_every_sample"], [message.every for message in layout.messages]
+    low_bits = kinds["counter_bits"][parts][0]
+    has_full_counter = kinds["counter_bits"] > low_bits
+    constants = np.zeros(1, CONSTANTS)
+    constants["all_parts"] = sum(1 << k for k in np.flatnonzero(parts).tolist())
+    constants["low_bits"], constants["full_bits"] = low_bits, kinds["counter_bits"].max()
+    constants["hold"] = np.max(2 * np.array(every) * has_full_counter)
+    return constants
 
 
 @kernel
-def _assemble(messages, tables, slots, latest, state, frames, found, rejects):  # type: ignore[no-untyped-def]
-    """Take all messages, after `found` held frames; how many are released, found and rejected."""
-    # Out of the tuples once: each access inside the loop would count references.
-    kinds, big_endian, fields, constants, checks, crc_tables, whole, low_bits, full_bits, hold = tables
-    begun, have, low_counters, indices, slot_data = slots
-    full_span = np.int64(1) << full_bits
+def _assemble(
+    messages: Records,
+    tables: Tables,
+    constants: Records,
+    slots: Records,
+    state: Records,
+    frames: Records,
+    held: int,
+    rejects: Records,
+) -> tuple[int, int, int]:
+    """Take all messages in; the first `held` frames wait for their full counter.
+
+    Returns
+    -------
+    tuple of 3 int
+        Frames that may go out; these and the held ones; rejects.
+    """
+    # Out of the tuple once: each access inside the loop would count references.
+    kinds, fields, fixed_bytes = tables
+    c, s = constants[0], state[0]
+    s["released"], s["found"], s["rejected"] = 0, held, 0
     data = np.zeros(_ROOM, np.uint8)
-    released = rejected = 0
     for i in range(messages.shape[0]):
         message = messages[np.uint64(i)]
-        index = state[_INDEX]
-        state[_INDEX] += 1
-        k = _kind_of(message.id, kinds)
+        k = _kind_of(message["id"], kinds)
         if k < 0:
-            state[_FOREIGN] += 1
-            continue
-        kind = kinds[k]
-        if message.length != kind[_LENGTH]:
-            state[_DAMAGED] += 1
-            rejected = _reject(rejects, rejected, index, _WRONG_LENGTH)
-            continue
-        for b in range(kind[_LENGTH]):
-            data[b] = message.data[b]
-        if not (
-            _constants_hold(data, constants, kind[_CONSTANT], kinds[k + 1, _CONSTANT])
-            and check_holds(data, 0, big_endian, checks[k], crc_tables[k])
-        ):
-            state[_DAMAGED] += 1
-            rejected = _reject(rejects, rejected, index, _CHECK_FAILED)
-            continue
-
-        if not kind[_IS_PART]:
-            state[_SLOW] += 1
-            fill(data, 0, fields[kind[_FIELD] : kinds[k + 1, _FIELD]], big_endian, latest[0])
-            if kind[_IS_FULL]:
-                shift = _anchor(state, latest[0].counter, low_bits, full_span)
-                for f in range(released, found):
-                    frames[f].counter = (frames[f].counter + shift) & (full_span - 1)
-                released = found
-            continue
-
-        low = read(data, kind[_COUNTER_AT], low_bits, False, big_endian)
-        if state[_HAS_SAMPLE]:
-            ahead = ahead_of(low, state[_COUNTER], low_bits)
-            if ahead < -LATE:
-                for s in range(OPEN_SAMPLES):
-                    rejected = _give_up(s, have, indices, state, rejects, rejected)
-                released = found
-                _forget(state, latest, hold)
-            elif ahead <= 0:
-                rejected = _reject(rejects, rejected, index, _STALE)
-                continue
-
-        slot = _slot_of(low, begun, have, low_counters)
-        if have[slot] and low_counters[slot] != low:
-            rejected = _give_up(slot, have, indices, state, rejects, rejected)
-        if have[slot] == 0:
-            begun[slot] = index
-            low_counters[slot] = low
-        bit = 1 << k
-        if have[slot] & bit:
-            rejected = _reject(rejects, rejected, index, _STALE)
-            continue
-        have[slot] |= bit
-        indices[slot, k] = index
-        for b in range(kind[_LENGTH]):
-            slot_data[slot, k, b] = data[b]
-        if have[slot] != whole:
-            continue
-
-        have[slot] = 0
-        for s in range(OPEN_SAMPLES):
-            if ahead_of(low_counters[s], low, low_bits) < 0:
-                rejected = _give_up(s, have, indices, state, rejects, rejected)
-        if state[_HAS_SAMPLE] or state[_IS_ANCHORED]:
-            state[_COUNTER] = (state[_COUNTER] + ahead_of(low, state[_COUNTER], low_bits)) & (full_span - 1)
+            s["foreign"] += 1
         else:
-            state[_COUNTER] = low
-        state[_HAS_SAMPLE] = 1
-        frames[found] = latest[0]
-        frame = frames[found]
-        found += 1
-        for part in range(kinds.shape[0] - 1):
-            if whole >> part & 1:
-                rows = fields[kinds[part, _FIELD] : kinds[part + 1, _FIELD]]
-                fill(slot_data[slot, part], 0, rows, big_endian, frame)
-        frame.counter = state[_COUNTER]
-        frame.offset = index
-        frame.t_ns = message.t_ns
-        frame.damaged = state[_DAMAGED]
-        frame.torn = state[_GIVEN_UP]
-        state[_DAMAGED] = state[_GIVEN_UP] = 0
-        if found - released > hold:
-            state[_IS_ANCHORED] = 1
-        if state[_IS_ANCHORED]:
-            released = found
-    return released, found, rejected
+            kind = kinds[np.uint64(k)]
+            fault = _fault(message, data, kind, fixed_bytes)
+            if fault != _SOUND:
+                s["damaged"] += 1
+                _reject(s["index"], fault, s, rejects)
+            elif not kind["in_every_sample"]:
+                _take_slow(data, kind, fields, c, s, frames)
+            else:
+                complete = _take_part(data, k, kind, c, s, slots, rejects)
+                if complete >= 0:
+                    _advance(slots[complete]["low"], c, s)
+                    _make_frame(frames, slots[complete], message["t_ns"], kinds, fields, s)
+                    _release(c, s)
+        s["index"] += 1
+    return s["released"], s["found"], s["rejected"]
 
 
 @kernel
-def _forget(state, latest, hold):  # type: ignore[no-untyped-def]
-    """Know nothing of the unit any more; counts stay."""
-    state[_COUNTER] = 0
-    state[_HAS_SAMPLE] = 0
-    state[_IS_ANCHORED] = hold == 0
-    latest[0].status = 0
-    for channel in range(MAX_TEMPERATURES):
-        latest[0].temperature[channel] = NO_TEMPERATURE
-
-
-@kernel
-def _anchor(state, full, low_bits, full_span):  # type: ignore[no-untyped-def]
-    """Settle the counter by the full one of a recent sample; how far off it was."""
-    shift = np.int64(0)
-    if state[_HAS_SAMPLE]:
-        expected = state[_COUNTER] + ahead_of(full, state[_COUNTER], low_bits)
-        shift = (full - expected) & (full_span - 1)
-        state[_COUNTER] = (state[_COUNTER] + shift) & (full_span - 1)
-        state[_DISAGREED] += shift != 0 and state[_IS_ANCHORED]
-    else:
-        state[_COUNTER] = full
-    state[_IS_ANCHORED] = 1
-    return shift
-
-
-@kernel
-def _kind_of(identifier, kinds):  # type: ignore[no-untyped-def]
+def _kind_of(identifier: int, kinds: Records) -> int:
     """Row of the kind with this identifier; -1 for a foreign one."""
-    for k in range(kinds.shape[0] - 1):
-        if kinds[k, _ID] == identifier:
+    for k in range(kinds.shape[0]):
+        if kinds[np.uint64(k)]["can_id"] == identifier:
             return k
     return -1
 
 
 @kernel
-def _constants_hold(data, constants, first, stop):  # type: ignore[no-untyped-def]
-    """Whether the bytes that never change are as they should be."""
-    holds = True
-    for c in range(first, stop):
-        holds &= data[constants[c, 0]] == constants[c, 1]
-    return holds
+def _fault(message: np.void, data: Bytes, kind: np.void, fixed_bytes: Records) -> int:
+    """Copy the bytes of a message to `data`; return why they are not of this kind, or `_SOUND`."""
+    if message["length"] != kind["length"]:
+        return _WRONG_LENGTH
+    _copy(message["data"], data, kind["length"])
+    for f in range(kind["first_constant"], kind["end_constant"]):
+        if data[fixed_bytes[f]["offset"]] != fixed_bytes[f]["value"]:
+            return _CHECK_FAILED
+    return _SOUND if check_holds(data, 0, kind) else _CHECK_FAILED
 
 
 @kernel
-def _slot_of(low, begun, have, low_counters):  # type: ignore[no-untyped-def]
+def _copy(source: Bytes, target: Bytes, length: int) -> None:
+    for b in range(np.uint64(length)):
+        target[b] = source[b]
+
+
+@kernel
+def _take_slow(data: Bytes, kind: np.void, fields: Records, c: np.void, s: np.void, frames: Records) -> None:
+    """Take a message that does not come with every sample; a full counter releases the held frames."""
+    s["slow"] += 1
+    fill(data, 0, kind, fields, s["latest"])
+    if kind["counter_bits"] > c["low_bits"]:
+        correction = _anchor(s["latest"]["counter"], c, s)
+        for f in range(s["released"], s["found"]):
+            frames[f]["counter"] = _wrapped(frames[f]["counter"] + correction, c)
+        s["released"] = s["found"]
+
+
+@kernel
+def _anchor(full: int, c: np.void, s: np.void) -> int:
+    """Set the counter by the full one of a recent sample; return by how much it changes."""
+    if s["has_sample"]:
+        expected = s["counter"] + ahead_of(full, s["counter"], c["low_bits"])
+        correction = _wrapped(full - expected, c)
+        s["counter"] = _wrapped(s["counter"] + correction, c)
+        if correction != 0 and s["is_anchored"]:
+            s["disagreements"] += 1
+    else:
+        correction = 0
+        s["counter"] = full
+    s["is_anchored"] = True
+    return int(correction)
+
+
+@kernel
+def _take_part(
+    data: Bytes, k: int, kind: np.void, c: np.void, s: np.void, slots: Records, rejects: Records
+) -> int:
+    """Take a message that comes with every sample; return the slot that it completes, or -1."""
+    low = read(data, kind["counter_offset"], c["low_bits"], False, kind["big_endian"])
+    ahead = ahead_of(low, s["counter"], c["low_bits"]) if s["has_sample"] else 1
+    if ahead < -LATE:
+        _restart(c, s, slots, rejects)
+    at = _slot_of(low, slots)
+    slot, part = slots[at], np.int64(1) << k
+    is_open = slot["parts"] != 0 and slot["low"] == low
+    if -LATE <= ahead <= 0 or (is_open and slot["parts"] & part):
+        _reject(s["index"], _STALE, s, rejects)
+        return -1
+    if not is_open:
+        _give_up(slot, s, rejects)
+        slot["begun"], slot["low"] = s["index"], low
+    slot["parts"] |= part
+    slot["index"][k] = s["index"]
+    _copy(data, slot["data"][k], kind["length"])
+    if slot["parts"] != c["all_parts"]:
+        return -1
+    slot["parts"] = 0
+    for other in range(OPEN_SAMPLES):
+        if ahead_of(slots[other]["low"], low, c["low_bits"]) < 0:
+            _give_up(slots[other], s, rejects)
+    return at
+
+
+@kernel
+def _slot_of(low: int, slots: Records) -> int:
     """Slot of the open sample `low`; otherwise a free one; otherwise the one begun first."""
-    slot = 0
-    for s in range(OPEN_SAMPLES):
-        if have[s] and low_counters[s] == low:
-            return s
-        if have[slot] and (have[s] == 0 or begun[s] < begun[slot]):
-            slot = s
-    return slot
+    best = 0
+    for i in range(OPEN_SAMPLES):
+        slot = slots[i]
+        if slot["parts"] and slot["low"] == low:
+            return i
+        if slots[best]["parts"] and (slot["parts"] == 0 or slot["begun"] < slots[best]["begun"]):
+            best = i
+    return best
 
 
 @kernel
-def _give_up(slot, have, indices, state, rejects, rejected):  # type: ignore[no-untyped-def]
+def _make_frame(
+    frames: Records, slot: np.void, t_ns: int, kinds: Records, fields: Records, s: np.void
+) -> None:
+    """Make the next frame of a complete sample and of what holds since earlier messages."""
+    frames[s["found"]] = s["latest"]
+    frame = frames[s["found"]]
+    for k in range(kinds.shape[0]):
+        kind = kinds[np.uint64(k)]
+        if kind["in_every_sample"]:
+            fill(slot["data"][np.uint64(k)], 0, kind, fields, frame)
+    frame["counter"], frame["offset"], frame["t_ns"] = s["counter"], s["index"], t_ns
+    frame["damaged"], frame["torn"] = s["damaged"], s["torn"]
+    s["damaged"] = s["torn"] = 0
+    s["found"] += 1
+
+
+@kernel
+def _advance(low: int, c: np.void, s: np.void) -> None:
+    """Count on to the sample with these low bits."""
+    if s["has_sample"] or s["is_anchored"]:
+        s["counter"] = _wrapped(s["counter"] + ahead_of(low, s["counter"], c["low_bits"]), c)
+    else:
+        s["counter"] = low
+    s["has_sample"] = True
+
+
+@kernel
+def _wrapped(counter: int, c: np.void) -> int:
+    """Counter modulo its full width."""
+    return int(counter & ((np.int64(1) << c["full_bits"]) - 1))
+
+
+@kernel
+def _restart(c: np.void, s: np.void, slots: Records, rejects: Records) -> None:
+    """The unit has restarted: give up all open samples, release the held frames, forget the rest."""
+    for i in range(OPEN_SAMPLES):
+        _give_up(slots[i], s, rejects)
+    s["released"] = s["found"]
+    _forget(c, s)
+
+
+@kernel
+def _forget(c: np.void, s: np.void) -> None:
+    """Know nothing of the unit any more; counts stay."""
+    s["counter"], s["has_sample"], s["is_anchored"] = 0, False, c["hold"] == 0
+    s["latest"]["status"] = 0
+    for channel in range(MAX_TEMPERATURES):
+        s["latest"]["temperature"][channel] = NO_TEMPERATURE
+
+
+@kernel
+def _release(c: np.void, s: np.void) -> None:
+    """Let the frames go if their full counter is known, or has been waited for long enough."""
+    if s["found"] - s["released"] > c["hold"]:
+        s["is_anchored"] = True
+    if s["is_anchored"]:
+        s["released"] = s["found"]
+
+
+@kernel
+def _give_up(slot: np.void, s: np.void, rejects: Records) -> None:
     """Reject the messages of the sample in `slot`, if there is one, as torn."""
-    state[_GIVEN_UP] += have[slot] != 0
-    for k in range(indices.shape[1]):
-        if have[slot] >> k & 1:
-            rejected = _reject(rejects, rejected, indices[slot, k], _TORN)
-    have[slot] = 0
-    return rejected
+    if slot["parts"] == 0:
+        return
+    s["torn"] += 1
+    for k in range(MAX_MESSAGES):
+        if slot["parts"] >> k & 1:
+            _reject(slot["index"][k], _TORN, s, rejects)
+    slot["parts"] = 0
 
 
 @kernel
-def _reject(rejects, rejected, index, reason):  # type: ignore[no-untyped-def]
+def _reject(index: int, reason: int, s: np.void, rejects: Records) -> None:
     """Add the message `index` to the rejects."""
-    rejects[rejected, 0] = index
-    rejects[rejected, 1] = 1
-    rejects[rejected, 2] = reason
-    return rejected + 1
+    reject = rejects[s["rejected"]]
+    reject["offset"], reject["length"], reject["reason"] = index, 1, reason
+    s["rejected"] += 1

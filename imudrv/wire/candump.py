@@ -1,4 +1,4 @@
-"""Text of a candump log to CAN messages and back, a line a message.
+"""Text of a candump log to CAN messages and back, one line per message.
 
     (1700000000.123456) can0 150#0001FFFF02004000            classic, id of 3 or 8 hex digits
     (1700000000.123456) can0 158##1000102...                 CAN FD: ``##`` and one digit of flags
@@ -6,7 +6,7 @@
 A record holds the number of an identifier, not whether it was sent with 11 or 29 bits.
 """
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +15,10 @@ from imudrv.errors import InputError
 from imudrv.kernels import kernel
 from imudrv.records import MESSAGE, REJECT, Reason, Records
 from imudrv.units import NS_PER_S
+from imudrv.wire.fields import Bytes
 
 LONGEST_LINE: Final = 256
-"""Characters of a line, its end not counted; a longer one is no message."""
+"""Characters of a line, without its end; a longer one is no message."""
 MOST_CHANNELS: Final = 16
 """Channels that are told apart by name, as many as candump itself listens to."""
 
@@ -36,7 +37,7 @@ _DIGITS = np.frombuffer(b"0123456789ABCDEF", np.uint8).copy()
 
 
 class CandumpDecoder:
-    """Decoder of candump log text; feed it as it comes, in any pieces.
+    """Decoder of candump log text; feed it text as it arrives, in any pieces.
 
     The messages and rejects are the same for any cut of the text into pieces, and every byte fed is in the
     line of a message, in a blank line, in a reject (its line, whole) or among the `pending` ones. Remote
@@ -151,7 +152,7 @@ class CandumpDecoder:
         Returns
         -------
         messages, rejects
-            As from `feed`; at the most one of both together.
+            As from `feed`; at most one of both together.
         """
         messages, rejects = self.feed(b"\n")
         self._is_closed = True
@@ -162,8 +163,21 @@ class CandumpDecoder:
 
 
 @kernel
-def _scan(text, ends, messages, rejects, names, counts):  # type: ignore[no-untyped-def]
-    """Read every whole line; `ends` has where their newlines stand."""
+def _scan(
+    text: Bytes,
+    ends: NDArray[np.intp],
+    messages: Records,
+    rejects: Records,
+    names: Bytes,
+    counts: NDArray[np.int64],
+) -> tuple[int, int]:
+    """Read every whole line; `ends` are the positions of their newlines.
+
+    Returns
+    -------
+    tuple of 2 int
+        Messages and rejects.
+    """
     start = found = rejected = 0
     for i in range(ends.shape[0]):
         end = ends[np.uint64(i)]
@@ -173,13 +187,13 @@ def _scan(text, ends, messages, rejects, names, counts):  # type: ignore[no-unty
         if row == 0:
             found += 1
         else:
-            message.data[:] = 0
+            message["data"][:] = 0
             if row > 0:
                 counts[np.uint64(row)] += 1
             elif text[_skip_blanks(text, start)] != _NEWLINE or end - start > LONGEST_LINE:
-                rejects[rejected].offset = start
-                rejects[rejected].length = end + 1 - start
-                rejects[rejected].reason = _NOT_A_MESSAGE
+                rejects[rejected]["offset"] = start
+                rejects[rejected]["length"] = end + 1 - start
+                rejects[rejected]["reason"] = _NOT_A_MESSAGE
                 rejected += 1
         start = end + 1
     counts[0] += found
@@ -187,7 +201,7 @@ def _scan(text, ends, messages, rejects, names, counts):  # type: ignore[no-unty
 
 
 @kernel
-def _parse(text, p, message, names):  # type: ignore[no-untyped-def]
+def _parse(text: Bytes, p: int, message: np.void, names: Bytes) -> int:
     """Read the line at `p` into `message`, whose data are zeros; no step goes past the line's newline.
 
     Returns 0 for a message of the channel that is read, the place of the channel's name for one of another
@@ -203,7 +217,7 @@ def _parse(text, p, message, names):  # type: ignore[no-untyped-def]
         return _NO_MESSAGE
     for _ in range(9 - digits):
         fraction *= 10
-    message.t_ns = seconds * NS_PER_S + fraction
+    message["t_ns"] = seconds * NS_PER_S + fraction
     channel = _skip_blanks(text, p + 1)
     if channel == p + 1:
         return _NO_MESSAGE
@@ -227,14 +241,14 @@ def _parse(text, p, message, names):  # type: ignore[no-untyped-def]
     limit = 0x7FF if p - begin == 3 else 0x1FFFFFFF
     if (p - begin != 3 and p - begin != 8) or identifier > limit or text[p] != _HASH:
         return _NO_MESSAGE
-    message.id = identifier
+    message["id"] = identifier
     p += 1
     longest = 8
-    message.fd = 0
+    message["fd"] = 0
     if text[p] == _HASH:
         if _NIBBLES[text[p + 1]] == _NOT_HEX:
             return _NO_MESSAGE
-        message.fd = 1
+        message["fd"] = 1
         longest = 64
         p += 2
 
@@ -246,10 +260,10 @@ def _parse(text, p, message, names):  # type: ignore[no-untyped-def]
         low = _NIBBLES[text[np.uint64(p + 1)]]
         if low == _NOT_HEX:
             return _NO_MESSAGE
-        message.data[np.uint64(length)] = high << 4 | low
+        message["data"][np.uint64(length)] = high << 4 | low
         length += 1
         p += 2
-    message.length = length
+    message["length"] = length
     end = _skip_blanks(text, p)
     if end > p and (text[end] == _RECEIVED or text[end] == _TRANSMITTED):
         end = _skip_blanks(text, end + 1)
@@ -257,7 +271,7 @@ def _parse(text, p, message, names):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _row_of(text, begin, names):  # type: ignore[no-untyped-def]
+def _row_of(text: Bytes, begin: int, names: Bytes) -> int:
     """Row of the channel whose name is at `begin`; a new channel gets the first free row."""
     length = 0
     while text[begin + length] > _SPACE:
@@ -275,20 +289,26 @@ def _row_of(text, begin, names):  # type: ignore[no-untyped-def]
     return MOST_CHANNELS
 
 
+class _Decimal(NamedTuple):
+    end: int
+    value: int  # right for up to 18 digits
+    digits: int
+
+
 @kernel
-def _decimal(text, p):  # type: ignore[no-untyped-def]
-    """Where the digits at `p` end, their value (right for up to 18 of them) and how many they are."""
+def _decimal(text: Bytes, p: int) -> _Decimal:
+    """Read the digits at `p`."""
     begin = p
-    value = np.int64(0)
+    value = 0
     while _ZERO <= text[p] <= _ZERO + 9:
-        value = value * 10 + np.int64(text[p] - _ZERO)
+        value = value * 10 + int(text[p] - _ZERO)
         p += 1
-    return p, value, p - begin
+    return _Decimal(p, value, p - begin)
 
 
 @kernel
-def _skip_blanks(text, p):  # type: ignore[no-untyped-def]
-    """Where the spaces, tabs and carriage returns at `p` end."""
+def _skip_blanks(text: Bytes, p: int) -> int:
+    """Return where the spaces, tabs and carriage returns at `p` end."""
     while text[p] == _SPACE or text[p] == _TAB or text[p] == _RETURN:
         p += 1
     return p
@@ -300,14 +320,14 @@ def format_candump(messages: Records, channel: str = "can0") -> bytes:
     Parameters
     ----------
     messages : ndarray of MESSAGE, shape (n,)
-        What to write.
+        The messages.
     channel : str
         Name of the interface.
 
     Returns
     -------
     bytes
-        One line a message: ``(seconds.micro) channel ID#DATA``, for CAN FD ``ID##1DATA``.
+        One line per message: ``(seconds.micro) channel ID#DATA``, for CAN FD ``ID##1DATA``.
 
     Raises
     ------
@@ -322,7 +342,7 @@ def format_candump(messages: Records, channel: str = "can0") -> bytes:
     if messages["t_ns"].min() < 0:
         raise InputError(
             f"message {int(messages['t_ns'].argmin())}: expected a time from 1970 on, "
-            f"got {int(messages['t_ns'].min())} ns; a candump log cannot tell it"
+            f"got {int(messages['t_ns'].min())} ns; a candump log cannot hold it"
         )
     around_data = len("(1700000000.123456)  12345678##1\n") + name.size
     text = np.empty(messages.size * (around_data + 2 * int(messages["length"].max())), np.uint8)
@@ -330,43 +350,50 @@ def format_candump(messages: Records, channel: str = "can0") -> bytes:
 
 
 @kernel
-def _write(messages, name, text):  # type: ignore[no-untyped-def]
-    """Write the lines of all messages to `text`; how many bytes they took."""
+def _write(messages: Records, name: Bytes, text: Bytes) -> int:
+    """Write the lines of all messages to `text`; return their length in bytes."""
     p = 0
     for i in range(messages.shape[0]):
         message = messages[np.uint64(i)]
-        text[p] = _OPEN
-        microseconds = message.t_ns // 1000
-        for k in range(16, 10, -1):
-            text[p + 1 + k] = _ZERO + microseconds % 10
-            microseconds //= 10
-        text[p + 11] = _POINT
-        for k in range(9, -1, -1):
-            text[p + 1 + k] = _ZERO + microseconds % 10
-            microseconds //= 10
-        text[p + 18] = _CLOSE
-        text[p + 19] = _SPACE
-        p += 20
+        p = _put(text, p, _OPEN)
+        p = _put_decimal(text, p, message["t_ns"] // NS_PER_S, 10)
+        p = _put(text, p, _POINT)
+        p = _put_decimal(text, p, message["t_ns"] % NS_PER_S // 1000, 6)
+        p = _put(text, p, _CLOSE)
+        p = _put(text, p, _SPACE)
         for k in range(name.shape[0]):
-            text[p] = name[k]
-            p += 1
-        text[p] = _SPACE
-        p += 1
-        digits = 3 if message.id <= 0x7FF else 8
-        for k in range(digits):
-            text[p + k] = _DIGITS[message.id >> np.uint32(4 * (digits - 1 - k)) & np.uint32(15)]
-        p += digits
-        text[p] = _HASH
-        p += 1
-        if message.fd:
-            text[p] = _HASH
-            text[p + 1] = _ZERO + 1
-            p += 2
-        for k in range(message.length):
-            byte = message.data[np.uint64(k)]
-            text[p] = _DIGITS[byte >> 4]
-            text[p + 1] = _DIGITS[byte & 15]
-            p += 2
-        text[p] = _NEWLINE
-        p += 1
+            p = _put(text, p, name[k])
+        p = _put(text, p, _SPACE)
+        p = _put_hex(text, p, message["id"], 3 if message["id"] <= 0x7FF else 8)
+        p = _put(text, p, _HASH)
+        if message["fd"]:
+            p = _put(text, p, _HASH)
+            p = _put(text, p, _ZERO + 1)
+        for k in range(message["length"]):
+            p = _put_hex(text, p, message["data"][np.uint64(k)], 2)
+        p = _put(text, p, _NEWLINE)
     return p
+
+
+@kernel
+def _put(text: Bytes, p: int, character: int) -> int:
+    """Write a character; return the position after it."""
+    text[np.uint64(p)] = character
+    return p + 1
+
+
+@kernel
+def _put_decimal(text: Bytes, p: int, value: int, digits: int) -> int:
+    """Write the last `digits` decimal digits of a value; return the position after them."""
+    for k in range(digits):
+        text[np.uint64(p + digits - 1 - k)] = _ZERO + value % 10
+        value //= 10
+    return p + digits
+
+
+@kernel
+def _put_hex(text: Bytes, p: int, value: int, digits: int) -> int:
+    """Write the last `digits` hexadecimal digits of a value; return the position after them."""
+    for k in range(digits):
+        text[np.uint64(p + digits - 1 - k)] = _DIGITS[value >> 4 * k & 15]
+    return p + digits

@@ -5,29 +5,52 @@ that one loop serves every width. Tables by the slicing method (Kounavis and Ber
 algorithms for high-performance CRC generation", IEEE Trans. Computers 57(11), 2008).
 """
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
 from imudrv.kernels import kernel
 from imudrv.wire.layout import Check, CheckKind
 
-KIND, WIDTH, START, STOP, OFFSET, INIT, XOR_OUT = range(7)
-"""Columns of the check row in `Tables.check`."""
+CHECK: Final = np.dtype(
+    [
+        ("kind", np.int64),  # CheckKind
+        ("width", np.int64),
+        ("start", np.int64),
+        ("stop", np.int64),
+        ("offset", np.int64),
+        ("init", np.int64),  # register before the first byte
+        ("xor_out", np.int64),
+        ("crc_table", np.uint32, (8, 256)),
+    ],
+    align=True,
+)
+"""A `Check` as the kernels read it."""
 
 
-def crc_table(check: Check) -> NDArray[np.uint32]:
-    """Slicing tables of a CRC.
+def check_table(check: Check) -> np.void:
+    """Put a check into the form that the kernels read.
 
     Parameters
     ----------
     check : Check
-        Width, polynomial and direction.
+        The check of a message.
 
     Returns
     -------
-    ndarray, shape (8, 256)
-        `table[k, b]`: effect of byte `b` followed by `k` zero bytes. Zeros where there is no CRC.
+    void of CHECK
     """
+    table: np.void = np.zeros(1, CHECK)[0]
+    table["kind"], table["width"], table["offset"] = check.kind, check.width, check.offset
+    table["start"], table["stop"] = check.start, check.stop
+    table["init"], table["xor_out"] = _start_value(check), check.xor_out
+    table["crc_table"] = _crc_table(check)
+    return table
+
+
+def _crc_table(check: Check) -> NDArray[np.uint32]:
+    """Return `table[k, b]`: effect of byte `b` followed by `k` zero bytes. Zeros where there is no CRC."""
     table = np.zeros((8, 256), np.uint32)
     if check.kind not in (CheckKind.CRC, CheckKind.CRC_REFLECTED):
         return table
@@ -53,23 +76,12 @@ def crc_table(check: Check) -> NDArray[np.uint32]:
     return table
 
 
-def start_value(check: Check) -> int:
-    """Register before the first byte of the message: the initial value after the prefix.
-
-    Parameters
-    ----------
-    check : Check
-        The check.
-
-    Returns
-    -------
-    int
-        In the register's own form, see the module's text.
-    """
+def _start_value(check: Check) -> int:
+    """Register before the first byte of the message: the initial value after the prefix."""
     if check.kind in (CheckKind.NONE, CheckKind.SUM):
         return check.init + sum(check.prefix)
     reflected = check.kind is CheckKind.CRC_REFLECTED
-    table = crc_table(check)[0]
+    table = _crc_table(check)[0]
     register = _reflect(check.init, check.width) if reflected else check.init << (32 - check.width)
     for byte in check.prefix:
         if reflected:
@@ -84,15 +96,15 @@ def _reflect(value: int, width: int) -> int:
 
 
 @kernel
-def compute(data, position, check, table):  # type: ignore[no-untyped-def]
-    """Check value of the message that begins at `position` of `data`; see `imudrv.wire.layout.Check`."""
-    kind, width = check[KIND], check[WIDTH]
-    # Where the register's byte k stands that meets byte k of the message.
+def compute(data: NDArray[np.uint8], position: int, check: np.void) -> int:
+    """Compute the check value of the message at `position` of `data`; see `imudrv.wire.layout.Check`."""
+    kind, width, table = check["kind"], check["width"], check["crc_table"]
+    # How far the register is shifted right for its byte that meets byte 0, 1, 2, 3 of the message.
     s0, s1, s2, s3 = (0, 8, 16, 24) if kind == CheckKind.CRC_REFLECTED else (24, 16, 8, 0)
-    register = np.uint32(check[INIT])
+    register = np.uint32(check["init"])
     # Unsigned positions spare numba's test for a negative index at every byte: twice as fast. Loops one after
     # the other, none in a branch, spare the counting of references to the arrays.
-    p, stop = np.uint64(position + check[START]), np.uint64(position + check[STOP])
+    p, stop = np.uint64(position + check["start"]), np.uint64(position + check["stop"])
     one, step = np.uint64(1), np.uint64(8)
     while kind == CheckKind.SUM and p < stop:
         register = np.uint32(register + data[p])
@@ -113,4 +125,4 @@ def compute(data, position, check, table):  # type: ignore[no-untyped-def]
         p += one
     if kind == CheckKind.CRC:
         register = np.uint32(register >> (32 - width))
-    return (np.int64(register) ^ check[XOR_OUT]) & ((np.int64(1) << width) - 1)
+    return int((np.int64(register) ^ check["xor_out"]) & ((np.int64(1) << width) - 1))

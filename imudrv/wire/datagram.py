@@ -1,4 +1,4 @@
-"""The output datagram `I50N`, version 1: 76 bytes a sample, one or more in a packet (ICD, section 7)."""
+"""The output datagram `I50N`, version 1: 76 bytes per sample, one or more in a packet (ICD, section 7)."""
 
 from enum import IntEnum
 from typing import Final, NamedTuple
@@ -11,7 +11,7 @@ from imudrv.records import INCREMENTS, Records
 from imudrv.wire.check import compute
 from imudrv.wire.layout import Check, CheckKind, Layout, Message
 from imudrv.wire.stream import StreamDecoder
-from imudrv.wire.tables import message_tables
+from imudrv.wire.tables import layout_tables
 
 MAGIC: Final = b"I50N"
 VERSION: Final = 1
@@ -36,7 +36,7 @@ _SAME: Final = ("flags", "counter", "interval_ns", "t_ns", "dtheta_b", "dv_b")
 
 
 class Source(IntEnum):
-    """Where the samples come from."""
+    """Origin of the samples."""
 
     HARDWARE = 0
     REPLAY = 1
@@ -44,28 +44,29 @@ class Source(IntEnum):
 
 
 def encode(increments: Records, source: Source) -> bytes:
-    """Datagrams of compensated increments.
+    """Encode compensated increments as datagrams.
 
     Parameters
     ----------
     increments : ndarray of INCREMENTS
-        In order; the counter goes out modulo 2^32.
+        In order; the counter is sent modulo 2^32.
     source : Source
-        Where they come from.
+        Origin of the samples.
 
     Returns
     -------
     bytes
-        76 a sample, back to back.
+        76 per sample, back to back.
     """
     data = np.empty((len(increments), SIZE), np.uint8)
-    _fill(increments, data, data.view(DATAGRAM), int(source), _TABLES.check, _TABLES.crc_table)
+    _fill(increments, data, data.view(DATAGRAM), int(source), _KINDS)
     return data.tobytes()
 
 
 @kernel
-def _fill(increments, data, rows, source, check, crc_table):  # type: ignore[no-untyped-def]
-    """Write datagrams; `rows` and `data` are the same memory."""
+def _fill(increments: Records, data: NDArray[np.uint8], rows: Records, source: int, kinds: Records) -> None:
+    """Write datagrams; `rows`, shape (n, 1), and `data` are the same memory."""
+    check = kinds[0]["check"]
     for i in range(increments.shape[0]):
         sample, row, out = increments[i], rows[i, 0], data[i]
         for k in range(len(MAGIC)):
@@ -75,11 +76,11 @@ def _fill(increments, data, rows, source, check, crc_table):  # type: ignore[no-
         row["interval_ns"], row["t_ns"] = sample["interval_ns"], sample["t_ns"]
         for k in range(3):
             row["dtheta_b"][k], row["dv_b"][k] = sample["dtheta_b"][k], sample["dv_b"][k]
-        row["crc"] = np.uint32(compute(out, 0, check, crc_table))
+        row["crc"] = np.uint32(compute(out, 0, check))
 
 
 class Received(NamedTuple):
-    """What a `DatagramDecoder` found.
+    """Samples and rejects of a `DatagramDecoder`.
 
     Parameters
     ----------
@@ -88,7 +89,7 @@ class Received(NamedTuple):
     source : ndarray of uint8
         `Source` of each.
     rejects : ndarray of REJECT
-        Stretches that are no datagram.
+        Runs of bytes that are no datagram.
     """
 
     increments: Records
@@ -116,7 +117,7 @@ _LAYOUT: Final = Layout(
 )
 
 
-_TABLES: Final = message_tables(_LAYOUT, _LAYOUT.messages[0])
+_KINDS: Final = layout_tables(_LAYOUT)[0]
 
 
 class DatagramDecoder:
@@ -137,7 +138,7 @@ class DatagramDecoder:
         Returns
         -------
         Received
-            What became complete with them.
+            Samples and rejects that they complete.
         """
         begin = self._finder.bytes_fed - self._finder.pending
         buffer = np.concatenate([self._tail, np.frombuffer(data, np.uint8)])

@@ -1,4 +1,4 @@
-"""Frames from whatever a unit's line carries, by its profile, and a tally of what is no frame."""
+"""Frames from what a unit's line carries, by its profile, and counts of what is no frame."""
 
 from dataclasses import dataclass, field
 from typing import Final
@@ -15,18 +15,18 @@ _SHOWN: Final = 3
 
 
 @dataclass
-class Rejected:
-    """What one reason took away.
+class RejectedRuns:
+    """Runs of input that were rejected for one reason.
 
     Parameters
     ----------
-    stretches, length : int
-        How many, and how many bytes (of assembled CAN: messages) together.
+    runs, length : int
+        Number of runs, and of bytes (of assembled CAN: messages) in all of them.
     first : list of int
         Offsets of the first few.
     """
 
-    stretches: int = 0
+    runs: int = 0
     length: int = 0
     first: list[int] = field(default_factory=list)
 
@@ -37,22 +37,22 @@ class FrameDecoder:
     Parameters
     ----------
     layout : Layout
-        Of the profile.
+        Layout of the profile.
     """
 
     def __init__(self, layout: Layout) -> None:
-        self.rejected: dict[Reason, Rejected] = {}
+        self.rejected: dict[Reason, RejectedRuns] = {}
         self._decoder = CanAssembler(layout) if layout.can else StreamDecoder(layout)
 
     def feed(self, data: bytes | memoryview | Records, t_ns: int = 0) -> Records:
-        """Take in what arrived.
+        """Decode what arrived.
 
         Parameters
         ----------
         data : bytes-like or ndarray of MESSAGE
             Any number of bytes, or for a CAN profile messages.
         t_ns : int
-            Time of arrival of bytes; messages bear their own.
+            Time of arrival of bytes; messages have their own.
 
         Returns
         -------
@@ -66,7 +66,7 @@ class FrameDecoder:
             assert not isinstance(data, np.ndarray)
             frames, rejects = self._decoder.feed(data, t_ns)
         if rejects.size:
-            self.tally(rejects)
+            self.count_rejects(rejects)
         return frames
 
     def close(self) -> Records:
@@ -78,15 +78,15 @@ class FrameDecoder:
             The frames that were held back.
         """
         frames, rejects = self._decoder.close()
-        self.tally(rejects)
+        self.count_rejects(rejects)
         return frames
 
-    def tally(self, rejects: Records) -> None:
-        """Count stretches that are no frame, by reason."""
+    def count_rejects(self, rejects: Records) -> None:
+        """Count rejects by reason."""
         for reason in np.unique(rejects["reason"]):
             same = rejects[rejects["reason"] == reason]
-            entry = self.rejected.setdefault(Reason(reason), Rejected())
-            entry.stretches += len(same)
+            entry = self.rejected.setdefault(Reason(reason), RejectedRuns())
+            entry.runs += len(same)
             entry.length += int(same["length"].sum())
             entry.first += same["offset"][: _SHOWN - len(entry.first)].tolist()
 
@@ -97,7 +97,7 @@ class CaptureDecoder:
     Parameters
     ----------
     layout : Layout
-        Of the profile.
+        Layout of the profile.
     channel : str, optional
         The channel of a candump log to read; that of the first message if absent.
     """
@@ -107,8 +107,8 @@ class CaptureDecoder:
         self.log = CandumpDecoder(channel) if layout.can else None
 
     @property
-    def rejected(self) -> dict[Reason, Rejected]:
-        """What is no frame, by reason."""
+    def rejected(self) -> dict[Reason, RejectedRuns]:
+        """Rejected runs, by reason."""
         return self._frames.rejected
 
     def feed(self, data: bytes | memoryview) -> Records:
@@ -127,7 +127,7 @@ class CaptureDecoder:
         if self.log is None:
             return self._frames.feed(data)
         messages, rejects = self.log.feed(data)
-        self._frames.tally(rejects)
+        self._frames.count_rejects(rejects)
         return self._frames.feed(messages)
 
     def close(self) -> Records:
@@ -141,5 +141,5 @@ class CaptureDecoder:
         if self.log is None:
             return self._frames.close()
         messages, rejects = self.log.close()
-        self._frames.tally(rejects)
+        self._frames.count_rejects(rejects)
         return np.concatenate([self._frames.feed(messages), self._frames.close()])

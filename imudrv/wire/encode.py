@@ -1,4 +1,4 @@
-"""Pulses to the bytes of a stream or to CAN messages: the simulator's and the tests' direction."""
+"""Pulses to the bytes of a stream or to CAN messages, for the simulator and the tests."""
 
 from typing import Final
 
@@ -8,9 +8,9 @@ from numpy.typing import ArrayLike, NDArray
 from imudrv.errors import InputError
 from imudrv.kernels import kernel
 from imudrv.records import MAX_TEMPERATURES, MESSAGE, Records
-from imudrv.wire.check import KIND, OFFSET, WIDTH, compute
-from imudrv.wire.layout import ACCELEROMETER, COUNTER, GYRO, STATUS, TEMPERATURE, Field, Layout, Message
-from imudrv.wire.tables import message_tables
+from imudrv.wire.check import compute
+from imudrv.wire.layout import ACCELEROMETER, COUNTER, GYRO, STATUS, TEMPERATURE, CheckKind, Field, Layout
+from imudrv.wire.tables import layout_tables
 
 _TARGETS: Final = TEMPERATURE + MAX_TEMPERATURES
 _PULSES: Final = slice(GYRO, STATUS)
@@ -22,22 +22,23 @@ _NAMES: Final = (
 
 
 class _Encoder:
-    """What both encoders share: the numbers of every field, checked, and the running totals.
+    """Common part of the encoders: the numbers of every field, checked, and the running totals.
 
     Parameters
     ----------
     layout : Layout
-        What is encoded.
+        Layout of the profile.
     totals : array_like of int, shape (6,)
         Running totals before the first sample, gyro and accelerometer X Y Z; for profiles with totals.
     """
 
     def __init__(self, layout: Layout, totals: ArrayLike = (0, 0, 0, 0, 0, 0)) -> None:
         self._layout = layout
+        self._tables = layout_tables(layout)
         self._totals = np.array(totals, np.int64)
 
     def _numbers(self, pulses: Records) -> NDArray[np.int64]:
-        """Give the number of each target, shape (n, `_TARGETS`), one column a target."""
+        """Return the number of each target, shape (n, `_TARGETS`), one column for each target."""
         numbers = np.zeros((pulses.size, _TARGETS), np.int64)
         numbers[:, COUNTER] = pulses["counter"]
         numbers[:, GYRO:ACCELEROMETER] = pulses["gyro"]
@@ -54,6 +55,13 @@ class _Encoder:
             self._totals = numbers[-1, _PULSES].copy()
         return numbers
 
+    def _messages(self, numbers: NDArray[np.int64], k: int) -> NDArray[np.uint8]:
+        """Encode `numbers` as messages of kind `k`, one a row."""
+        kinds, fields, constants = self._tables
+        rows = np.zeros((len(numbers), kinds[k]["length"]), np.uint8)
+        _write_rows(rows, numbers, kinds[k], fields, constants)
+        return rows
+
     def _put_temperature(self, numbers: NDArray[np.int64], pulses: Records, field: Field) -> None:
         channel = field.target - TEMPERATURE
         degc = pulses["temperature_degc"][:, channel]
@@ -63,7 +71,7 @@ class _Encoder:
 
     def _require_room(self, numbers: NDArray[np.int64], field: Field) -> None:
         column = numbers[:, field.target]
-        # A total of n bits tells increments apart like a signed number of n bits.
+        # A total of n bits distinguishes as many increments as a signed number of n bits.
         is_total = self._layout.totals and field.target != STATUS
         lowest, highest = _limits(field.bits, field.signed or is_total)
         outside = (column < lowest) | (column > highest)
@@ -73,28 +81,28 @@ class _Encoder:
                 f"sample {int(numbers[first, COUNTER])}, {_NAMES[field.target]}: "
                 f"expected {lowest} to {highest}, the {field.bits} bits of profile {self._layout.name}, "
                 f"got {int(column[first])}; "
-                "take a profile with wider fields, or calmer motion"
+                "use a profile with wider fields, or slower motion"
             )
 
 
 class StreamEncoder(_Encoder):
-    """Encoder of a stream profile; the running totals go on from call to call.
+    """Encoder of a stream profile; the running totals continue from call to call.
 
     Parameters
     ----------
     layout : Layout
-        Of a stream profile.
+        Layout of a stream profile.
     totals : array_like of int, shape (6,)
         Running totals before the first sample, gyro and accelerometer X Y Z; for profiles with totals.
     """
 
     def encode(self, pulses: Records) -> NDArray[np.uint8]:
-        """Write samples.
+        """Encode samples.
 
         Parameters
         ----------
         pulses : ndarray of PULSES, shape (n,)
-            Each of one interval. Counters go out modulo the width of their field; temperatures are rounded
+            Each of one interval. Counters are sent modulo the width of their field; temperatures are rounded
             and clipped to theirs, NaN becomes 0 counts.
 
         Returns
@@ -107,23 +115,22 @@ class StreamEncoder(_Encoder):
         InputError
             A number that its field cannot hold.
         """
-        (message,) = self._layout.messages
-        return _encode(self._numbers(pulses), self._layout, message)
+        return self._messages(self._numbers(pulses), 0)
 
 
 class CanEncoder(_Encoder):
-    """Encoder of a CAN profile; the running totals go on from call to call.
+    """Encoder of a CAN profile; the running totals continue from call to call.
 
     Parameters
     ----------
     layout : Layout
-        Of a CAN profile.
+        Layout of a CAN profile.
     totals : array_like of int, shape (6,)
         Running totals before the first sample, gyro and accelerometer X Y Z; for profiles with totals.
     """
 
     def encode(self, pulses: Records) -> Records:
-        """Write samples.
+        """Encode samples.
 
         Parameters
         ----------
@@ -153,7 +160,7 @@ class CanEncoder(_Encoder):
             messages["t_ns"][at] = pulses["arrival_ns"][is_sent[:, k]]
             messages["id"][at] = kind.can_id
             messages["length"][at] = kind.length
-            messages["data"][at, : kind.length] = _encode(numbers[is_sent[:, k]], self._layout, kind)
+            messages["data"][at, : kind.length] = self._messages(numbers[is_sent[:, k]], k)
         return messages
 
 
@@ -161,31 +168,27 @@ def _limits(bits: int, signed: bool) -> tuple[int, int]:
     return (-(1 << (bits - 1)), (1 << (bits - 1)) - 1) if signed else (0, (1 << bits) - 1)
 
 
-def _encode(numbers: NDArray[np.int64], layout: Layout, message: Message) -> NDArray[np.uint8]:
-    rows = np.zeros((len(numbers), message.length), np.uint8)
-    for offset, value in message.constants:
-        rows[:, offset] = value
-    _fill_rows(rows, numbers, message_tables(layout, message))
-    return rows
-
-
 @kernel
-def _fill_rows(rows, numbers, tables):  # type: ignore[no-untyped-def]
-    """Write the fields and the check of one kind of message, one message a row."""
-    # Out of the tuple once: each access inside the loop would count references.
-    _, big_endian, _, fields, check, crc_table = tables
+def _write_rows(
+    rows: NDArray[np.uint8], numbers: NDArray[np.int64], kind: np.void, fields: Records, constants: Records
+) -> None:
+    """Write messages of one kind, one a row."""
+    check, big_endian = kind["check"], kind["big_endian"]
     for i in range(rows.shape[0]):
         row = rows[np.uint64(i)]
-        for f in range(fields.shape[0]):
-            field = fields[np.uint64(f)]
-            _write(row, field[1], field[2], big_endian, numbers[np.uint64(i), np.uint64(field[0])])
-        if check[KIND] != 0:
-            _write(row, check[OFFSET], check[WIDTH], big_endian, compute(row, 0, check, crc_table))
+        for c in range(np.uint64(kind["first_constant"]), np.uint64(kind["end_constant"])):
+            row[np.uint64(constants[c]["offset"])] = constants[c]["value"]
+        for f in range(np.uint64(kind["first_field"]), np.uint64(kind["end_field"])):
+            field = fields[f]
+            value = numbers[np.uint64(i), np.uint64(field["target"])]
+            _write(row, field["offset"], field["bits"], big_endian, value)
+        if check["kind"] != CheckKind.NONE:
+            _write(row, check["offset"], check["width"], big_endian, compute(row, 0, check))
 
 
 @kernel
-def _write(row, p, bits, big_endian, value):  # type: ignore[no-untyped-def]
-    """Put the low `bits` (8, 16, 24, 32) of `value` at `p`."""
+def _write(row: NDArray[np.uint8], p: int, bits: int, big_endian: bool, value: int) -> None:
+    """Write the low `bits` (8, 16, 24, 32) of `value` at `p`."""
     for shift in range(0, bits, 8):
         at = p + (bits - 8 - shift if big_endian else shift) // 8
         row[np.uint64(at)] = value >> shift & 0xFF

@@ -6,16 +6,21 @@ Every kernel may read three bytes past the end of the message: buffers keep `SLA
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imudrv.kernels import kernel
-from imudrv.wire.check import KIND, OFFSET, WIDTH, compute
+from imudrv.records import Records
+from imudrv.wire.check import compute
+from imudrv.wire.layout import ACCELEROMETER, COUNTER, GYRO, STATUS, TEMPERATURE, CheckKind
+
+Bytes = NDArray[np.uint8]
 
 SLACK: Final = 4
-"""Spare bytes behind the last message of a buffer: a number is read as four bytes whatever its width."""
+"""Spare bytes after the last message of a buffer: a number is read as four bytes whatever its width."""
 
 
 @kernel
-def read(data, p, bits, signed, big_endian):  # type: ignore[no-untyped-def]
+def read(data: Bytes, p: int, bits: int, signed: bool, big_endian: bool) -> int:
     """Read the number of `bits` (8, 16, 24, 32) at `p`, as int64."""
     four = data[np.uint64(p) : np.uint64(p + 4)]
     b0, b1, b2, b3 = np.int64(four[0]), np.int64(four[1]), np.int64(four[2]), np.int64(four[3])
@@ -25,38 +30,41 @@ def read(data, p, bits, signed, big_endian):  # type: ignore[no-untyped-def]
         word = b0 | b1 << 8 | b2 << 16 | b3 << 24
     spare = 64 - bits
     if signed:
-        return (word << spare) >> spare
-    return word & ((np.int64(1) << bits) - 1)
+        return int((word << spare) >> spare)
+    return int(word & ((np.int64(1) << bits) - 1))
 
 
 @kernel
-def ahead_of(counter, other, bits):  # type: ignore[no-untyped-def]
+def ahead_of(counter: int | np.int64, other: int | np.int64, bits: int) -> int:
     """By how much the low `bits` of `counter` are ahead of those of `other`, as a signed number of `bits`."""
-    return (counter - other) << (64 - bits) >> (64 - bits)
+    return int((counter - other) << (64 - bits) >> (64 - bits))
 
 
 @kernel
-def check_holds(data, p, big_endian, check, crc_table):  # type: ignore[no-untyped-def]
-    """Whether the message at `p` carries the check value that its bytes give."""
-    stands = read(data, p + check[OFFSET], check[WIDTH], False, big_endian)
+def check_holds(data: Bytes, p: int, kind: np.void) -> bool:
+    """Whether the message at `p` carries the check value of its bytes."""
+    check = kind["check"]
+    carried = read(data, p + check["offset"], check["width"], False, kind["big_endian"])
     # Computed even where there is none: a branch around it would count references to the arrays.
-    return (stands == compute(data, p, check, crc_table)) | (check[KIND] == 0)
+    return bool((carried == compute(data, p, check)) | (check["kind"] == CheckKind.NONE))
 
 
 @kernel
-def fill(data, p, fields, big_endian, frame):  # type: ignore[no-untyped-def]
-    """Read every field of the message at `p` into `frame`; other members stay as they are."""
+def fill(data: Bytes, p: int, kind: np.void, fields: Records, frame: np.void) -> None:
+    """Read every field of the message at `p` into `frame`; other members keep their values."""
+    big_endian = kind["big_endian"]
     # Unsigned indices spare numba's test for negative ones.
-    for f in range(np.uint64(fields.shape[0])):
-        target, offset, bits, signed = fields[f, 0], fields[f, 1], fields[f, 2], fields[f, 3]
-        value = read(data, p + offset, bits, signed != 0, big_endian)
-        if target == 0:
+    for f in range(np.uint64(kind["first_field"]), np.uint64(kind["end_field"])):
+        field = fields[f]
+        target = field["target"]
+        value = read(data, p + field["offset"], field["bits"], field["signed"], big_endian)
+        if target == COUNTER:
             frame["counter"] = value
-        elif target < 4:
-            frame["gyro"][np.uint64(target - 1)] = np.int32(value)
-        elif target < 7:
-            frame["accelerometer"][np.uint64(target - 4)] = np.int32(value)
-        elif target == 7:
+        elif target < ACCELEROMETER:
+            frame["gyro"][np.uint64(target - GYRO)] = np.int32(value)
+        elif target < STATUS:
+            frame["accelerometer"][np.uint64(target - ACCELEROMETER)] = np.int32(value)
+        elif target == STATUS:
             frame["status"] = np.uint32(value)
         else:
-            frame["temperature"][np.uint64(target - 8)] = np.int32(value)
+            frame["temperature"][np.uint64(target - TEMPERATURE)] = np.int32(value)

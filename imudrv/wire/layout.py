@@ -1,4 +1,4 @@
-"""How the messages of one profile look: all that decoding and encoding need to know."""
+"""Layout of the messages of one profile: all that decoding and encoding need to know."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -11,9 +11,12 @@ STATUS: Final = 7
 TEMPERATURE: Final = 8
 """Targets of a field: the counter, three gyro and three accelerometer axes, the status, then temperatures."""
 
+MAX_MESSAGES: Final = 16
+"""Kinds of message that a profile may have."""
+
 
 class CheckKind(IntEnum):
-    """How a message is protected."""
+    """Kind of protection of a message."""
 
     NONE = 0
     SUM = 1
@@ -27,13 +30,13 @@ class Field(NamedTuple):
     Parameters
     ----------
     target : int
-        What it is: `COUNTER`, `GYRO` + axis, `ACCELEROMETER` + axis, `STATUS` or `TEMPERATURE` + channel.
+        Meaning: `COUNTER`, `GYRO` + axis, `ACCELEROMETER` + axis, `STATUS` or `TEMPERATURE` + channel.
     offset : int
-        Of its first byte.
+        Position of its first byte.
     bits : int
-        8, 16, 24 or 32.
+        Width: 8, 16, 24 or 32.
     signed : bool
-        Two's complement.
+        Whether it is in two's complement.
     """
 
     target: int
@@ -48,18 +51,18 @@ class Check(NamedTuple):
     Parameters
     ----------
     kind : CheckKind
-        What is computed.
+        Kind of check.
     width : int
-        Bits of the result: 8, 16 or 32.
+        Bits of the check value: 8, 16 or 32.
     start, stop : int
-        The bytes it covers, `stop` excluded.
+        Range of bytes that it covers, `stop` excluded.
     offset : int
-        Where it stands.
+        Position of the check value.
     polynomial, init, xor_out : int
-        The CRC's parameters in the notation of R. N. Williams, "A painless guide to CRC error detection
+        Parameters of the CRC in the notation of R. N. Williams, "A painless guide to CRC error detection
         algorithms" (1993); unreflected.
     prefix : bytes
-        Bytes that are not in the message but are covered first.
+        Bytes that are covered first, but are not in the message.
     """
 
     kind: CheckKind = CheckKind.NONE
@@ -81,15 +84,15 @@ class Message(NamedTuple):
     length : int
         Bytes of the whole message.
     fields : tuple of Field
-        Its numbers.
+        Numbers of the message.
     constants : tuple of (int, int)
         Offset and value of the bytes that never change (sync, id, length), in the order to test them.
     check : Check
-        Its protection.
+        Protection of the message.
     can_id : int
         CAN identifier; 0 in a stream.
     every : int
-        It is sent with each `every`-th sample; a sample exists when all messages with 1 have arrived.
+        The message comes with every n-th sample; a sample is complete when all messages with 1 have come.
     """
 
     length: int
@@ -105,7 +108,7 @@ class Message(NamedTuple):
 
 
 class StatusMasks(NamedTuple):
-    """Which bits of the status word mean what for the driver."""
+    """Masks of the status word, by their meaning for the driver."""
 
     fault: int = 0
     saturated: int = 0
@@ -122,23 +125,23 @@ class Layout:
     Parameters
     ----------
     name : str
-        Of the profile.
+        Name of the profile.
     can : bool
-        CAN messages; otherwise a byte stream of one kind of message.
+        Whether the unit sends CAN messages; otherwise a byte stream of one kind of message.
     fd : bool
-        The CAN messages are CAN FD.
+        Whether the CAN messages are CAN FD.
     big_endian : bool
         Byte order of every number.
     interval_ns : int
-        Sample interval.
+        Sample interval, ns.
     totals : bool
-        The pulses are running totals; otherwise increments.
+        Whether the pulses are running totals; otherwise increments.
     counter_bits, pulse_bits : int
         Widths of the full counter and of the narrowest pulse field.
     messages : tuple of Message
-        What is sent.
+        Kinds of message that the unit sends.
     temperature_names : tuple of str
-        What each temperature channel measures.
+        Sensor of each temperature channel.
     degc_per_count, degc_at_zero : tuple of float
         Scale and origin of each temperature channel.
     status : StatusMasks

@@ -1,4 +1,4 @@
-"""A byte stream to frames: finds them, checks them, and gives every other byte back with a reason."""
+"""A byte stream to frames: finds them, checks them, and returns every other byte with a reason."""
 
 from typing import Final, NamedTuple
 
@@ -9,24 +9,34 @@ from imudrv.kernels import kernel
 from imudrv.records import FRAME, REJECT, Reason, Records
 from imudrv.wire.fields import SLACK, check_holds, fill
 from imudrv.wire.layout import Layout
-from imudrv.wire.tables import message_tables
+from imudrv.wire.tables import Tables, layout_tables
+
+STATE: Final = np.dtype(
+    [
+        ("offset", np.int64),  # of the buffer's first byte in the stream
+        ("reject_offset", np.int64),  # where the run of rejected bytes begins that is still open; -1: none
+        ("reject_reason", np.int64),
+        ("skipped", np.int64),  # rejected bytes since the last frame
+    ],
+    align=True,
+)
+"""State that a call of the kernel leaves to the next."""
 
 _NO_SYNC: Final = int(Reason.NO_SYNC)
 _CHECK_FAILED: Final = int(Reason.CHECK_FAILED)
-_OPEN_OFFSET, _OPEN_REASON, _SKIPPED = range(3)
 _REJECTS_AT_ONCE: Final = 1024
 _NO_REJECTS: Final = np.zeros(0, REJECT)
 
 
 class Decoded(NamedTuple):
-    """What a decoder found.
+    """Frames and rejects of a decoder.
 
     Parameters
     ----------
     frames : ndarray of FRAME
         Good frames in the order of arrival.
     rejects : ndarray of REJECT
-        Stretches that are no frame, each with its `Reason`.
+        Runs of input that are no frame, each with its `Reason`.
     """
 
     frames: Records
@@ -34,26 +44,24 @@ class Decoded(NamedTuple):
 
 
 class StreamDecoder:
-    """Decoder of a byte stream; feed it as it comes, in any pieces.
+    """Decoder of a byte stream; feed it bytes as they arrive, in any pieces.
 
     The frames and rejects are the same for any cut of the stream into pieces, and every byte fed is in a
-    frame, in a reject, or among the `pending` ones. After damage the search resumes one byte on.
+    frame, in a reject, or among the `pending` ones. After a bad frame the search resumes at its second byte.
 
     Parameters
     ----------
     layout : Layout
-        Of a stream profile.
+        Layout of a stream profile.
     """
 
     def __init__(self, layout: Layout) -> None:
-        (message,) = layout.messages
-        # A plain tuple: a named one reaches a kernel 1 us later.
-        self._tables = tuple(message_tables(layout, message))
-        self._length = message.length
-        self._buffer: NDArray[np.uint8] = np.zeros(message.length + SLACK, np.uint8)
+        self._tables = layout_tables(layout)
+        self._length = layout.messages[0].length
+        self._buffer: NDArray[np.uint8] = np.zeros(self._length + SLACK, np.uint8)
         self._pending = 0
-        self._offset = 0
-        self._state = np.array([-1, 0, 0], np.int64)
+        self._state = np.zeros(1, STATE)
+        self._state["reject_offset"] = -1
         self._rejects = np.zeros(_REJECTS_AT_ONCE, REJECT)
 
     @property
@@ -64,7 +72,7 @@ class StreamDecoder:
     @property
     def bytes_fed(self) -> int:
         """Bytes fed since the beginning."""
-        return self._offset + self._pending
+        return int(self._state[0]["offset"]) + self._pending
 
     def feed(self, data: bytes | bytearray | memoryview | NDArray[np.uint8], t_ns: int = 0) -> Decoded:
         """Take bytes in.
@@ -79,7 +87,7 @@ class StreamDecoder:
         Returns
         -------
         Decoded
-            What became complete with them.
+            Frames and rejects that they complete.
         """
         piece = np.frombuffer(data, np.uint8)
         stop = self._pending + piece.size
@@ -88,42 +96,39 @@ class StreamDecoder:
             grown[: self._pending] = self._buffer[: self._pending]
             self._buffer = grown
         self._buffer[self._pending : stop] = piece
-        frames = np.zeros(stop // self._length, FRAME)
-        rejects = []
-        position = found = 0
+        frames = room = np.zeros(stop // self._length, FRAME)
+        rejects: list[Records] = []
+        position = 0
         while True:
-            position, found, rejected, hungry = _scan(
-                self._buffer,
-                position,
-                stop,
-                self._tables,
-                self._state,
-                self._offset,
-                t_ns,
-                frames,
-                found,
-                self._rejects,
+            position, found, rejected, is_done = _scan(
+                self._buffer, position, stop, t_ns, self._tables, self._state, room, self._rejects
             )
             if rejected:
                 rejects.append(self._rejects[:rejected].copy())
-            if hungry:
+            if is_done:
                 break
+            room = room[found:]
         self._pending = stop - position
         if self._pending:
             self._buffer[: self._pending] = self._buffer[position:stop].copy()
-        self._offset += position
-        return Decoded(frames[:found], _joined(rejects))
+        return Decoded(frames[: frames.size - room.size + found], _joined(rejects))
 
     def close(self) -> Decoded:
-        """End of the stream: what is still open or pending comes out as rejects."""
-        rejects = []
-        if self._state[_OPEN_OFFSET] >= 0:
-            begun = self._state[_OPEN_OFFSET]
-            rejects.append(np.array([(begun, self._offset - begun, self._state[_OPEN_REASON])], REJECT))
-            self._state[_OPEN_OFFSET] = -1
+        """End of the stream: what is still open or pending becomes a reject.
+
+        Returns
+        -------
+        Decoded
+            Rejects only.
+        """
+        s, rejects = self._state[0], []
+        if s["reject_offset"] >= 0:
+            begin, reason = s["reject_offset"], s["reject_reason"]
+            rejects.append(np.array([(begin, s["offset"] - begin, reason)], REJECT))
+            s["reject_offset"] = -1
         if self._pending:
-            rejects.append(np.array([(self._offset, self._pending, Reason.UNFINISHED)], REJECT))
-            self._offset += self._pending
+            rejects.append(np.array([(s["offset"], self._pending, Reason.UNFINISHED)], REJECT))
+            s["offset"] += self._pending
             self._pending = 0
         return Decoded(np.zeros(0, FRAME), _joined(rejects))
 
@@ -132,49 +137,84 @@ def _joined(rejects: list[Records]) -> Records:
     return np.concatenate(rejects) if rejects else _NO_REJECTS
 
 
+_DIFFERS, _MATCHES, _IS_CUT = range(3)
+"""How bytes compare with those that begin a frame."""
+
+
 @kernel
-def _scan(data, p, stop, tables, state, offset, t_ns, frames, found, rejects):  # type: ignore[no-untyped-def]
-    """Walk from `p` until the data or the room for rejects ends; `offset`: stream offset of `data[0]`."""
+def _scan(
+    data: NDArray[np.uint8],
+    p: int,
+    stop: int,
+    t_ns: int,
+    tables: Tables,
+    state: Records,
+    frames: Records,
+    rejects: Records,
+) -> tuple[int, int, int, bool]:
+    """Walk from `p` until the data or the room for rejects ends.
+
+    Returns
+    -------
+    tuple
+        Position of the first byte that is neither in a frame nor rejected; number of frames and of rejects;
+        whether the data have ended. Bytes before that position then leave the buffer.
+    """
     # Out of the tuple once: each access inside the loop would count references.
-    length, big_endian, constants, fields, check, crc_table = tables
-    rejected = 0
-    while p < stop and rejected < rejects.shape[0]:
-        matches = True
-        for c in range(constants.shape[0]):
-            at = p + constants[c, 0]
-            if at >= stop:
-                return p, found, rejected, True
-            if data[at] != constants[c, 1]:
-                matches = False
-                break
-        if not matches:
-            if state[_OPEN_OFFSET] < 0:
-                state[_OPEN_OFFSET] = offset + p
-                state[_OPEN_REASON] = _NO_SYNC
-            state[_SKIPPED] += 1
+    kinds, fields, constants = tables
+    kind, s = kinds[0], state[0]
+    length, offset = kind["length"], s["offset"]
+    found = rejected = 0
+    while rejected < rejects.shape[0]:
+        header = _compare(data, p, stop, constants)
+        if header == _DIFFERS:
+            _skip(s, offset + p, _NO_SYNC)
             p += 1
             continue
-        if p + length > stop:
+        if header == _IS_CUT or p + length > stop:
+            s["offset"] += p
             return p, found, rejected, True
-        good = check_holds(data, p, big_endian, check, crc_table)
-        if state[_OPEN_OFFSET] >= 0:
-            rejects[rejected]["offset"] = state[_OPEN_OFFSET]
-            rejects[rejected]["length"] = offset + p - state[_OPEN_OFFSET]
-            rejects[rejected]["reason"] = state[_OPEN_REASON]
+        is_good = check_holds(data, p, kind)
+        if s["reject_offset"] >= 0:
+            _close_reject(rejects[rejected], s, offset + p)
             rejected += 1
-            state[_OPEN_OFFSET] = -1
-        if good:
-            frame = frames[found]
-            fill(data, p, fields, big_endian, frame)
-            frame["offset"] = offset + p
-            frame["t_ns"] = t_ns
-            frame["damaged"] = (state[_SKIPPED] + length - 1) // length
-            state[_SKIPPED] = 0
-            found += 1
-            p += length
-        else:
-            state[_OPEN_OFFSET] = offset + p
-            state[_OPEN_REASON] = _CHECK_FAILED
-            state[_SKIPPED] += 1
+        if not is_good:
+            _skip(s, offset + p, _CHECK_FAILED)
             p += 1
-    return p, found, rejected, p >= stop
+            continue
+        frame = frames[found]
+        fill(data, p, kind, fields, frame)
+        frame["offset"], frame["t_ns"] = offset + p, t_ns
+        frame["damaged"] = (s["skipped"] + length - 1) // length
+        s["skipped"] = 0
+        found += 1
+        p += length
+    return p, found, rejected, False
+
+
+@kernel
+def _compare(data: NDArray[np.uint8], p: int, stop: int, constants: Records) -> int:
+    """Compare the bytes at `p` with the constant bytes of a frame, as far as they have come."""
+    for c in range(constants.shape[0]):
+        at = p + constants[c]["offset"]
+        if at >= stop:
+            return _IS_CUT
+        if data[at] != constants[c]["value"]:
+            return _DIFFERS
+    return _MATCHES
+
+
+@kernel
+def _skip(s: np.void, offset: int, reason: int) -> None:
+    """Reject the byte at this offset of the stream; the first one of a run gives the reason of all."""
+    if s["reject_offset"] < 0:
+        s["reject_offset"], s["reject_reason"] = offset, reason
+    s["skipped"] += 1
+
+
+@kernel
+def _close_reject(reject: np.void, s: np.void, end: int) -> None:
+    """Write down the open run of rejected bytes, which ends at this offset of the stream."""
+    reject["offset"], reject["length"] = s["reject_offset"], end - s["reject_offset"]
+    reject["reason"] = s["reject_reason"]
+    s["reject_offset"] = -1

@@ -4,11 +4,11 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from size_effect import size_effect_rate
 
 from calib import gauge
 from calib.gauge import GAUGES, Arms, Gauge, convert, from_kalibr, from_psins, to_kalibr, to_psins
 from imudrv.errors import InputError
-from imudrv.nav.size_effect import size_effect_rate
 from imudrv.units import MM
 
 Array = NDArray[np.float64]

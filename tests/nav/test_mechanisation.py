@@ -10,13 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
+from size_effect import size_effect_increment
 
 from imudrv.errors import InputError
 from imudrv.nav.attitude import conjugate, product, quaternion_of_matrix, quaternion_of_vector, rotation, turn
 from imudrv.nav.earth import EARTH_RATE, ECCENTRICITY_SQUARED, SEMI_MAJOR_AXIS, earth_rate_n, normal_gravity
 from imudrv.nav.mechanisation import MEASUREMENT, NAVIGATION, Navigator, body_step
-from imudrv.nav.size_effect import size_effect_increment
 from imudrv.records import INCREMENTS, Records
+from imudrv.site import Site
 from imudrv.units import MM, NS, UG, URAD
 
 Array = NDArray[np.float64]
@@ -363,6 +364,17 @@ def test_rows_bear_the_samples_they_belong_to() -> None:
     assert rows["t_ns"].tolist() == increments["t_ns"][[3, 7]].tolist()
     assert rows["flags"].tolist() == increments["flags"][[3, 7]].tolist()
     assert Navigator(*SITE, (1, 0, 0, 0), C_ba=C_BA).feed(increments).dtype == MEASUREMENT
+
+
+@pytest.mark.parametrize("gravity", [None, 9.795])
+def test_navigation_from_a_site_starts_at_rest_at_its_place(gravity: float | None) -> None:
+    place = Site(latitude_deg=28.2, longitude_deg=113.0, height_m=60.0, gravity_m_s2=gravity)
+    q = np.array([0.5, 0.5, 0.5, 0.5])
+    options: dict[str, Any] = {"C_ba": C_BA, "every": 7}
+    by_site = Navigator.from_site(place, q, **options)
+    by_hand = Navigator(place.latitude_rad, place.longitude_rad, 60.0, gravity, q, **options)
+    assert not by_site.latest["v_n"].any()
+    assert by_site.feed(noisy(50)).tobytes() == by_hand.feed(noisy(50)).tobytes()
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-
-from imudrv.nav.size_effect import size_effect_increment, size_effect_rate
+from size_effect import size_effect_increment, size_effect_rate
 
 Array = NDArray[np.float64]
 C_BA = np.eye(3) + 1e-2 * np.array([[0.0, 2.0, -1.0], [-0.6, 0.0, 0.4], [-0.7, 0.3, 0.0]])

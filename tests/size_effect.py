@@ -1,21 +1,21 @@
-"""The size effect, linear in the sensing points: the formulas, readable (mathematics, sections 1 and 2).
+"""The size effect as numpy formulas, linear in the sensing points (mathematics, sections 1 and 2).
 
 At the sensing point r_i the specific force differs from that at the origin of b by `Omega r_i`. Accelerometer
-i senses along `a_i`, row i of inv(C_ba), and is read back into b by column i of C_ba:
+i senses along `a_i`, row i of inv(C_ba), and contributes to b by column i of C_ba:
 
     delta f_b = S R,   S = C_ba blockdiag(a_x^T Omega, a_y^T Omega, a_z^T Omega),   R = (r_x, r_y, r_z)
 
-For tests and reports; the kernel of :mod:`imudrv.nav.mechanisation` does the same sample by sample.
+A second, plain way to what the kernels of `imudrv.imu` and `imudrv.nav` compute sample by sample.
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from imudrv.arrays import Array
 
 
 def size_effect_rate(omega_ib_b: ArrayLike, omega_dot_b: ArrayLike, C_ba: ArrayLike) -> Array:
-    """S at an instant.
+    """Return S at an instant.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ def size_effect_rate(omega_ib_b: ArrayLike, omega_dot_b: ArrayLike, C_ba: ArrayL
 def size_effect_increment(
     omega0_b: ArrayLike, omega1_b: ArrayLike, dtheta_b: ArrayLike, T: ArrayLike, C_ba: ArrayLike
 ) -> Array:
-    """S integrated over an interval, in its own body axes.
+    """Return S integrated over an interval, in its own body axes.
 
     The tangential part telescopes, the centripetal part is Simpson's rule.
 
