@@ -224,9 +224,11 @@ class Profile(Model):
         return faults
 
     def _field_faults(self) -> list[str]:
+        return [*self._pulse_faults(), *self._counter_faults(), *self._status_and_temperature_faults()]
+
+    def _pulse_faults(self) -> list[str]:
         faults = []
         always = [n for m in self.messages if m.every == 1 for n in m.fields]
-        everywhere = [n for m in self.messages for n in m.fields]
         for name in ("gyro", "accelerometer"):
             axes = sorted(n.axis or "" for n in always if n.name == name)
             if axes != list(_AXES):
@@ -238,17 +240,27 @@ class Profile(Model):
             faults.append("fields: expected pulse totals of one width, got several")
         if self.counts == "increment" and any(n.type[0] == "u" for n in pulses):
             faults.append("fields: expected signed pulse increments, got an unsigned type")
+        return faults
+
+    def _counter_faults(self) -> list[str]:
+        faults = []
         for i, message in enumerate(self.messages):
             counters = [n for n in message.fields if n.name == "counter"]
             if len(counters) > 1 or (message.every == 1 and not counters):
                 faults.append(f"messages[{i}]: expected one counter field, got {len(counters)}")
             if any(n.type[0] != "u" for n in counters):
                 faults.append(f"messages[{i}].counter: expected an unsigned type")
+        always = [n for m in self.messages if m.every == 1 for n in m.fields]
         if len({n.bits for n in always if n.name == "counter"}) > 1:
             faults.append("counter: expected one width in the messages of every sample, got several")
-        if sum(n.name == "status" for n in everywhere) > 1:
+        return faults
+
+    def _status_and_temperature_faults(self) -> list[str]:
+        faults = []
+        numbers = [n for m in self.messages for n in m.fields]
+        if sum(n.name == "status" for n in numbers) > 1:
             faults.append("status: expected at most one field, got several")
-        sensors = [n.sensor for n in everywhere if n.name == "temperature"]
+        sensors = [n.sensor for n in numbers if n.name == "temperature"]
         if len(set(sensors)) < len(sensors) or len(sensors) > MAX_TEMPERATURES:
             faults.append(f"temperature: expected up to {MAX_TEMPERATURES}, each sensor once, got {sensors}")
         return faults

@@ -171,7 +171,7 @@ def test_pulses_that_do_not_fit_are_refused_by_axis_value_and_limit(layout, valu
     with pytest.raises(
         InputError,
         match=r"sample 123457, accelerometer z: expected -32768 to 32767, "
-        rf"the 16 bits of profile {layout.name}, got {value}; take",
+        rf"the 16 bits of profile {layout.name}, got {value}; use a",
     ):
         encoder.encode(pulses)
 
