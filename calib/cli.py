@@ -44,6 +44,7 @@ from imudrv.console import BAD_INPUT, OK, CommandLine, progress
 from imudrv.errors import InputError
 from imudrv.imu.rate_filter import NAMES, rate_filter
 from imudrv.nav.alignment import DURATION_S
+from imudrv.outputs import file_to_write, require_other
 from imudrv.recording import Recording
 from imudrv.sinks.files import replacing
 from imudrv.site import Site
@@ -241,6 +242,9 @@ def _verify(arguments: argparse.Namespace) -> int:
 
 def _identify(arguments: argparse.Namespace) -> None:
     stated = _stated(arguments.at)
+    inputs = (*arguments.captures, arguments.profile, arguments.calibration, arguments.site)
+    for output in filter(None, (arguments.output, arguments.json, arguments.report)):
+        _check_output(output, *inputs)
     basis = _basis(arguments)
     check_target(arguments.output, basis.calibration)
     site = config.read(arguments.site, Site)
@@ -285,6 +289,9 @@ def _validate(arguments: argparse.Namespace) -> int:
     """Judge recordings, or simulated units."""
     if (arguments.simulate is None) == (not arguments.recordings):
         raise InputError("validate: expected either recordings or --simulate")
+    if arguments.report is not None:
+        inputs = (*arguments.recordings, arguments.profile, arguments.calibration, arguments.site)
+        _check_output(arguments.report, *inputs)
     if arguments.simulate is not None:
         trials = [(trial, judge(trial)) for trial in _simulated(arguments)]
         shown = sum(trial.name.endswith("unit 1") for trial, _ in trials)
@@ -342,6 +349,12 @@ def _navigated(arguments: argparse.Namespace) -> tuple[Calibration, list[tuple[T
     return calibration, found
 
 
+def _check_output(path: Path, *inputs: str | Path | None) -> None:
+    """Refuse an output before the work, instead of behind it."""
+    file_to_write(path)
+    require_other(path, *inputs)
+
+
 def _written(path: Path, calibration: Calibration, arms: Arms) -> str:
     return f"{path}: certificate of unit {calibration.serial_number}, gauge {arms.gauge}"
 
@@ -382,6 +395,7 @@ def _basis(arguments: argparse.Namespace) -> Basis:
 
 
 def _gauge(arguments: argparse.Namespace) -> None:
+    _check_output(arguments.output, arguments.file)
     calibration = read_calibration(arguments.file)
     before = arms_of(calibration, str(arguments.file))
     stated = _stated(arguments.at)
@@ -410,6 +424,7 @@ def _export_arms(arguments: argparse.Namespace) -> None:
 
 
 def _import_arms(arguments: argparse.Namespace) -> None:
+    _check_output(arguments.output, arguments.file, arguments.calibration)
     calibration = read_calibration(arguments.calibration)
     if arguments.program == "kalibr":
         arms = from_kalibr(config.read(arguments.file, _Kalibr).imu0)

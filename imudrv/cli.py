@@ -2,8 +2,10 @@
 
 import argparse
 import json
+import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TextIO
 
 from rich.console import Console
 
@@ -19,6 +21,7 @@ from imudrv.export import KINDS, export
 from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import NAMES, rate_filter
 from imudrv.monitor import monitor
+from imudrv.outputs import is_standard_output, require_other
 from imudrv.profiles import Profile
 from imudrv.recording import Recording, pack
 from imudrv.service import Service
@@ -27,7 +30,7 @@ from imudrv.sim import scenario as scenarios
 from imudrv.sim.capture import record
 from imudrv.sim.live import play, speed_of
 from imudrv.sim.scenario import Scenario
-from imudrv.sinks.files import increment_columns, pulse_columns, replacing, table
+from imudrv.sinks.files import increment_columns, pulse_columns, table, writing
 from imudrv.site import Site
 from imudrv.status import EXIT_CODES, ask
 
@@ -63,7 +66,14 @@ def _commands() -> CommandLine:
 
     sub = add("decode", _decode, "Capture to pulse increments.")
     add_capture(sub)
-    sub.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="NAME.csv or NAME.npz")
+    sub.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        required=True,
+        metavar="OUT",
+        help="NAME.csv or NAME.npz; - is standard output, as csv",
+    )
 
     sub = add("compensate", _compensate, "Capture to compensated increments in body axes.")
     add_capture(sub)
@@ -77,14 +87,21 @@ def _commands() -> CommandLine:
         "--rate-filter", choices=NAMES, default="causal", help="for the size effect (default: causal)"
     )
     sub.add_argument(
-        "-o", "--output", type=Path, required=True, metavar="OUT", help="NAME.csv, NAME.npz or NAME.i50n"
+        "-o",
+        "--output",
+        type=Path,
+        required=True,
+        metavar="OUT",
+        help="NAME.csv, NAME.npz or NAME.i50n; - is standard output, as csv",
     )
 
     sub = add("sim", _sim, "A simulated unit: into a capture, or live as hardware in the loop.")
     sub.add_argument("scenario", help=f"{', '.join(scenarios.shipped())}, or a scenario file")
     add_profile(sub, required=True)
     way = sub.add_mutually_exclusive_group(required=True)
-    way.add_argument("-o", "--output", type=Path, metavar="CAPTURE", help="the capture to write")
+    way.add_argument(
+        "-o", "--output", type=Path, metavar="CAPTURE", help="the capture to write; - is standard output"
+    )
     way.add_argument(
         "--port",
         metavar="URL",
@@ -134,7 +151,14 @@ def _commands() -> CommandLine:
     sub = add("export", _export, "A recording in another format.")
     sub.add_argument("recording", type=Path)
     sub.add_argument("--to", choices=KINDS, required=True, help="the format")
-    sub.add_argument("-o", "--output", type=Path, required=True, metavar="OUT")
+    sub.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        required=True,
+        metavar="OUT",
+        help="- is standard output, for csv, raw, candump",
+    )
 
     sub = add("check", _check, "Check a calibration, site, profile, scenario or settings file.")
     sub.add_argument("file", type=Path, help="the file")
@@ -148,6 +172,7 @@ def _commands() -> CommandLine:
 
 
 def _decode(arguments: argparse.Namespace) -> None:
+    require_other(arguments.output, arguments.capture, arguments.profile)
     capture = _capture(arguments)
     parts = {"temperature_degc": capture.layout.temperature_names}
     with (
@@ -160,6 +185,7 @@ def _decode(arguments: argparse.Namespace) -> None:
 
 
 def _compensate(arguments: argparse.Namespace) -> None:
+    require_other(arguments.output, arguments.capture, arguments.profile, arguments.calibration)
     capture = _capture(arguments)
     if arguments.calibration is not None:
         calibration = read_calibration(arguments.calibration, arguments.unit)
@@ -183,8 +209,12 @@ def _compensate(arguments: argparse.Namespace) -> None:
     size_effect = (
         "compensated" if calibration.size_effect else "not compensated: the calibration has no sensing points"
     )
-    print(f"  unit {calibration.serial_number}, {origin}")
-    print(f"  size effect {size_effect}; rate filter {arguments.rate_filter}, {compensator.lag} samples late")
+    words = _words(arguments.output)
+    print(f"  unit {calibration.serial_number}, {origin}", file=words)
+    print(
+        f"  size effect {size_effect}; rate filter {arguments.rate_filter}, {compensator.lag} samples late",
+        file=words,
+    )
 
 
 def _capture(arguments: argparse.Namespace) -> Capture:
@@ -203,7 +233,9 @@ def _sim(arguments: argparse.Namespace) -> None:
     samples = scenarios.samples(scenario, layout.interval_ns)
     if arguments.truth is not None and arguments.truth.suffix != ".npz":
         raise InputError(f"--truth {arguments.truth}: expected a name ending in .npz")
-    with replacing(arguments.output) as capture, progress("simulate", samples) as advance:
+    for output in filter(None, (arguments.output, arguments.truth)):
+        require_other(output, arguments.profile, *scenarios.files(arguments.scenario))
+    with writing(arguments.output) as capture, progress("simulate", samples) as advance:
         if arguments.truth is None:
             for data, truth in record(scenario, layout):
                 capture.write(data)
@@ -214,7 +246,10 @@ def _sim(arguments: argparse.Namespace) -> None:
                     capture.write(data)
                     rows.write({name: truth[name] for name in truth.dtype.names or ()})
                     advance(len(truth))
-    print(f"{arguments.output}: {samples} samples of {layout.name}, seed {scenario.seed}")
+    print(
+        f"{arguments.output}: {samples} samples of {layout.name}, seed {scenario.seed}",
+        file=_words(arguments.output),
+    )
 
 
 def _play(arguments: argparse.Namespace) -> None:
@@ -250,6 +285,7 @@ def _doctor(arguments: argparse.Namespace) -> int:
 
 
 def _pack(arguments: argparse.Namespace) -> None:
+    require_other(arguments.output, arguments.recording)
     pack(arguments.recording, arguments.output)
     before, after = arguments.recording.stat().st_size, arguments.output.stat().st_size
     print(f"{arguments.output}: {after} bytes, was {before}")
@@ -257,7 +293,7 @@ def _pack(arguments: argparse.Namespace) -> None:
 
 def _export(arguments: argparse.Namespace) -> None:
     export(Recording(arguments.recording), arguments.to, arguments.output)
-    print(f"{arguments.recording} -> {arguments.output}")
+    print(f"{arguments.recording} -> {arguments.output}", file=_words(arguments.output))
 
 
 def _say(text: str) -> None:
@@ -281,12 +317,18 @@ def _check(arguments: argparse.Namespace) -> None:
 
 def _report(capture: Capture, output: Path) -> None:
     """The books of a capture, for people."""
-    print(f"{capture.path}: {capture.layout.name}, {capture.size} bytes -> {output}")
-    print(f"  {capture.accountant.account}")
+    words = _words(output)
+    print(f"{capture.path}: {capture.layout.name}, {capture.size} bytes -> {output}", file=words)
+    print(f"  {capture.accountant.account}", file=words)
     for reason, rejected in sorted(capture.rejected.items()):
         name = reason.name.lower().replace("_", " ")
         first = ", ".join(map(str, rejected.first))
         more = ", ..." if rejected.stretches > len(rejected.first) else ""
-        print(f"  {name}: {rejected.stretches} x, {rejected.length} in all, at {first}{more}")
+        print(f"  {name}: {rejected.stretches} x, {rejected.length} in all, at {first}{more}", file=words)
     for channel, messages in list(capture.channels.items())[1:]:
-        print(f"  left out: {messages} messages of channel {channel}")
+        print(f"  left out: {messages} messages of channel {channel}", file=words)
+
+
+def _words(output: Path) -> TextIO:
+    """Where the words about an output go: not among its bytes."""
+    return sys.stderr if is_standard_output(output) else sys.stdout

@@ -25,6 +25,7 @@ import yaml
 from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, ValidationError
 
 from imudrv.errors import FaultyFileError, InputError
+from imudrv.outputs import file_to_write
 
 MAX_BYTES: Final = 1 << 20
 """Largest settings file, bytes."""
@@ -170,7 +171,7 @@ def write(path: str | os.PathLike[str], document: Model | Mapping[str, object]) 
     """Write a settings file so that at every moment the old or the new one is there, whole.
 
     The file that was there is kept beside it under its name and time, ``NAME.20261122T100000Z.yaml``, with
-    ``.2``, ``.3`` ... behind the time where that is taken.
+    ``.2``, ``.3`` ... behind the time where that is taken. A symbolic link is followed.
 
     Parameters
     ----------
@@ -182,9 +183,10 @@ def write(path: str | os.PathLike[str], document: Model | Mapping[str, object]) 
     Raises
     ------
     InputError
-        It cannot be written, or what is there is no settings file: a folder, or too large.
+        It cannot be written, what is there is no settings file but too large, or see `file_to_write`.
     """
     path = Path(path)
+    target = file_to_write(path)
     data = yaml.dump(
         _plain(document), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=math.inf
     ).encode()
@@ -194,9 +196,9 @@ def write(path: str | os.PathLike[str], document: Model | Mapping[str, object]) 
         )
     _load(data, str(path))  # what is written can be read
     with _plain_words(path, "written", f"expected the folder {path.parent}, there is none; make it first"):
-        if path.exists():
-            _replace(_kept_name(path), _content(path))
-        _replace(path, data)
+        if target.exists():
+            _replace(_kept_name(target), _content(target))
+        _replace(target, data)
 
 
 def sha256(path: str | os.PathLike[str]) -> str:

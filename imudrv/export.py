@@ -27,9 +27,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imudrv.errors import InputError
+from imudrv.outputs import require_other
 from imudrv.recording import ORIGIN, Recording
 from imudrv.records import INCREMENTS, Flag, Records
-from imudrv.sinks.files import increment_columns, replacing, table
+from imudrv.sinks.files import increment_columns, replacing, table, writing
 from imudrv.units import DEG, NS, NS_PER_S
 from imudrv.wire.candump import format_candump
 
@@ -120,7 +121,7 @@ def export(recording: Recording, kind: str, target: Path) -> Exported:
     kind : str
         One of `KINDS`.
     target : Path
-        The file; it appears whole or not at all.
+        The file; it appears whole or not at all. For ``csv``, ``raw`` and ``candump`` also standard output.
 
     Returns
     -------
@@ -130,10 +131,11 @@ def export(recording: Recording, kind: str, target: Path) -> Exported:
     ------
     InputError
         An unknown kind, one that does not fit the recording, a sample that the format cannot hold, a damaged
-        recording, or a file that cannot be written.
+        recording, or a file that cannot be written or is the recording.
     """
     if kind not in KINDS:
         raise InputError(f"--to: expected one of {', '.join(KINDS)}, got {kind!r}")
+    require_other(target, recording.path)
     return KINDS[kind](recording, target)
 
 
@@ -152,7 +154,7 @@ def _export_table(suffix: str) -> Callable[[Recording, Path], Exported]:
 def _export_raw(recording: Recording, target: Path) -> Exported:
     _require_transport(recording, "serial", "--to candump")
     count = 0
-    with replacing(target) as file:
+    with writing(target) as file:
         for arrival in recording.arrivals():
             assert isinstance(arrival.data, bytes)
             count += file.write(arrival.data)
@@ -162,7 +164,7 @@ def _export_raw(recording: Recording, target: Path) -> Exported:
 def _export_candump(recording: Recording, target: Path) -> Exported:
     _require_transport(recording, "can", "--to raw")
     count = 0
-    with replacing(target) as file:
+    with writing(target) as file:
         for arrival in recording.arrivals():
             assert isinstance(arrival.data, np.ndarray)
             file.write(format_candump(arrival.data))

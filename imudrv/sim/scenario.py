@@ -364,6 +364,15 @@ def load(name_or_path: str) -> Scenario:
     return _read(Path(name_or_path))
 
 
+def files(name_or_path: str) -> tuple[Path, ...]:
+    """Files that a scenario comes from, that of its calibration included; none for a shipped one."""
+    path = Path(name_or_path)
+    if name_or_path in shipped():
+        return ()
+    calibration = read(path, Scenario).unit.calibration_file
+    return (path,) if calibration is None else (path, path.parent / calibration)
+
+
 def _read(path: Path) -> Scenario:
     scenario = read(path, Scenario)
     if scenario.unit.calibration_file is None:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imudrv.errors import InputError
+from imudrv.outputs import file_to_write, is_standard_output
 from imudrv.records import INCREMENTS, Records
 from imudrv.wire.datagram import Source, encode
 from imudrv.wire.layout import Layout
@@ -24,6 +25,7 @@ from imudrv.wire.layout import Layout
 Columns = Mapping[str, NDArray[np.generic]]
 _IN_RECORD: Final = {"dtheta": "dtheta_b", "dv": "dv_b"}
 _AXES: Final = ("x", "y", "z")
+_STANDARD_OUTPUT: Final = 1  # its file descriptor
 
 
 def pulse_columns(pulses: Records, layout: Layout) -> Columns:
@@ -192,7 +194,7 @@ def table(path: Path, kinds: Sequence[str], parts: Mapping[str, Sequence[str]]) 
     Parameters
     ----------
     path : Path
-        Where.
+        Where; standard output takes ``.csv``, as it comes.
     kinds : sequence of str
         The suffixes that make sense for what is written.
     parts : mapping of str to sequence of str
@@ -206,22 +208,58 @@ def table(path: Path, kinds: Sequence[str], parts: Mapping[str, Sequence[str]]) 
     Raises
     ------
     InputError
-        Another suffix, or a folder that cannot be written to.
+        Another suffix, or see `writing`.
     """
-    if path.suffix not in kinds:
+    suffix = ".csv" if is_standard_output(path) and ".csv" in kinds else path.suffix
+    if suffix not in kinds:
         raise InputError(
             f"{path}: expected a name ending in {', '.join(kinds)}, got {path.suffix or 'no suffix'}"
         )
-    with replacing(path) as file:
+    with writing(path) as file:
         rows: Table
-        if path.suffix == ".csv":
+        if suffix == ".csv":
             rows = CsvTable(file, parts)
-        elif path.suffix == ".npz":
-            rows = NpzTable(file, path.parent)
+        elif suffix == ".npz":
+            rows = NpzTable(file, Path(file.name).parent)
         else:
             rows = DatagramTable(file, Source.REPLAY)
         yield rows
         rows.finish()
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[IO[bytes]]:
+    """Standard output where the name means that, and a file as of `replacing` otherwise.
+
+    Parameters
+    ----------
+    path : Path
+        The name.
+
+    Yields
+    ------
+    binary file
+        To write to, from its beginning to its end.
+
+    Raises
+    ------
+    InputError
+        See `replacing`; or standard output is closed or full.
+    BrokenPipeError
+        The reader of standard output has left.
+    """
+    if not is_standard_output(path):
+        with replacing(path) as file:
+            yield file
+        return
+    try:
+        # A buffer of its own: what a full disk does not take must not be tried again at exit.
+        with open(_STANDARD_OUTPUT, "wb", closefd=False) as file:
+            yield file
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise InputError(f"standard output: cannot be written: {error.strerror or error}") from error
 
 
 @contextmanager
@@ -231,7 +269,7 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
     Parameters
     ----------
     path : Path
-        Its name; what has that name stays until then.
+        Its name; what has that name stays until then. A symbolic link is followed.
 
     Yields
     ------
@@ -241,14 +279,15 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
     Raises
     ------
     InputError
-        The folder is not there or cannot be written to, or the disk is full.
+        The folder is not there or cannot be written to, the disk is full, or see `file_to_write`.
     """
+    target = file_to_write(path)
     file: IO[bytes] | None = None
     try:
-        with NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
+        with NamedTemporaryFile(dir=target.parent, prefix=f".{target.name}.", delete=False) as file:
             yield file
         os.chmod(file.name, 0o666 & ~_umask())
-        os.replace(file.name, path)
+        os.replace(file.name, target)
         file = None
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error

@@ -9,6 +9,7 @@ from threading import Event, Thread
 from typing import Final, NamedTuple
 
 from imudrv.errors import InputError
+from imudrv.outputs import file_to_write
 
 PERIOD_S: Final = 0.05
 """What waits is written this often."""
@@ -59,7 +60,8 @@ class Spool:
     Raises
     ------
     InputError
-        There is such a file, the folder cannot be written to, or there is no room for the head.
+        There is such a file, the folder cannot be written to, there is no room for the head, or see
+        `file_to_write`.
     """
 
     def __init__(
@@ -69,8 +71,9 @@ class Spool:
         next_piece: Callable[[], Piece],
         last_piece: Callable[[], bytes] = bytes,
     ) -> None:
+        target = file_to_write(path)
         try:
-            self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+            self._file = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
         except FileExistsError as error:
             raise InputError(
                 f"{path}: expected a new file, there is one of that name; move it away or take another name"
@@ -82,7 +85,7 @@ class Spool:
         self._trouble = ""
         if not self._append(head):
             os.close(self._file)
-            path.unlink()
+            target.unlink()
             raise InputError(f"{path}: cannot be written: {self._trouble}")
         self._next_piece = next_piece
         self._last_piece = last_piece

@@ -1,0 +1,83 @@
+"""Where a command may write: the name of an output, checked before anything is written.
+
+An output takes its name at the end, in place of what has that name then. So a device, a pipe or a folder is
+refused, which would be replaced by a file, and so is an input.
+"""
+
+import os
+import stat
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+from imudrv.errors import InputError
+
+_STANDARD_OUTPUT: Final = ("-", "/dev/stdout")
+
+
+def is_standard_output(path: Path) -> bool:
+    """Whether a name means standard output: ``-`` or ``/dev/stdout``."""
+    return str(path) in _STANDARD_OUTPUT
+
+
+def file_to_write(path: Path) -> Path:
+    """Return the file that an output goes to: the name itself, or where it links to.
+
+    Parameters
+    ----------
+    path : Path
+        As the user gave it; there need be no such file yet.
+
+    Returns
+    -------
+    Path
+        No symbolic link.
+
+    Raises
+    ------
+    InputError
+        It is standard output, a folder, a device, a pipe or a socket, or cannot be looked at.
+    """
+    if is_standard_output(path):
+        raise InputError(f"{path}: expected a file, for this output cannot go to standard output")
+    try:
+        mode = path.stat().st_mode
+    except FileNotFoundError:
+        return Path(os.path.realpath(path))
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
+        raise InputError(f"{path}: cannot be written: {getattr(error, 'strerror', None) or error}") from error
+    if not stat.S_ISREG(mode):
+        raise InputError(f"{path}: expected a file, got {_kind(mode)}; choose another name")
+    return Path(os.path.realpath(path))
+
+
+def require_other(path: Path, *inputs: str | Path | None) -> None:
+    """Refuse an output that is one of its inputs, under whatever name.
+
+    Parameters
+    ----------
+    path : Path
+        The output.
+    inputs : str, Path or None
+        Files; what is None or no file is passed over.
+
+    Raises
+    ------
+    InputError
+        Names both.
+    """
+    output = Path("/dev/stdout") if is_standard_output(path) else path
+    for given in inputs:
+        with suppress(OSError, ValueError):
+            if given is not None and os.path.samefile(output, given):
+                raise InputError(
+                    f"{path}: expected an output apart from its input {given}, got the same file; "
+                    "choose another name"
+                )
+
+
+def _kind(mode: int) -> str:
+    for is_kind, name in ((stat.S_ISDIR, "folder"), (stat.S_ISFIFO, "pipe"), (stat.S_ISSOCK, "socket")):
+        if is_kind(mode):
+            return f"a {name}"
+    return "a device"
