@@ -39,7 +39,7 @@ def file_to_write(path: Path) -> Path:
         It is standard output, a folder, a device, a pipe or a socket, or cannot be looked at.
     """
     if is_standard_output(path):
-        raise InputError(f"{path}: expected the name of a file; this output cannot go to standard output")
+        raise InputError(f"{path}: expected a file, for this output cannot go to standard output")
     try:
         mode = path.stat().st_mode
     except FileNotFoundError:
@@ -47,7 +47,7 @@ def file_to_write(path: Path) -> Path:
     except (OSError, ValueError) as error:  # ValueError: a NUL in the path
         raise InputError(f"{path}: cannot be written: {getattr(error, 'strerror', None) or error}") from error
     if not stat.S_ISREG(mode):
-        raise InputError(f"{path}: expected the name of a file, got {_kind(mode)}; choose another name")
+        raise InputError(f"{path}: expected a file, got {_kind(mode)}; choose another name")
     return Path(os.path.realpath(path))
 
 

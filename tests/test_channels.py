@@ -65,8 +65,13 @@ def here(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize("log", ["two.log", "late.log"])
 def test_a_log_of_two_units_is_refused_by_every_command_however_late_the_second_comes(
-    command: str, log: str, here: Path, capsys: pytest.CaptureFixture[str]
+    command: str,
+    log: str,
+    here: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr("imudrv.captures.CHUNK_BYTES", 4096)  # the log is read in 70 pieces
     main, before, behind = COMMANDS[command]
     assert main([*before, log, *behind]) == 2
     assert capsys.readouterr().err == f"error: {BOTH.replace('two.log', log)}--channel can0\n"

@@ -128,7 +128,7 @@ def test_what_is_no_file_is_refused_and_stays_what_it_is(
     before, files = os.stat(name), set(os.listdir())
     assert run(command, output) == 2
     told = capsys.readouterr().err
-    assert told == f"error: {output}: expected the name of a file, got a {kind}; choose another name\n"
+    assert told == f"error: {output}: expected a file, got a {kind}; choose another name\n"
     after = os.stat(name)
     assert (after.st_ino, after.st_mode, after.st_rdev) == (before.st_ino, before.st_mode, before.st_rdev)
     assert set(os.listdir()) == files
@@ -238,7 +238,7 @@ def test_what_makes_no_sense_on_standard_output_is_refused_in_a_line(
     assert run(command, "-") == 2
     told = capsys.readouterr()
     assert told.out == ""
-    assert told.err == "error: -: expected the name of a file; this output cannot go to standard output\n"
+    assert told.err == "error: -: expected a file, for this output cannot go to standard output\n"
     assert set(os.listdir()) == files
 
 
@@ -269,7 +269,7 @@ def test_an_output_that_is_redirected_onto_its_input_is_refused(here: Path, made
 def test_a_live_file_is_made_neither_of_a_pipe_nor_of_standard_output(here: Path) -> None:
     os.mkfifo("pipe")
     for name, what in (("pipe", "got a pipe"), ("-", "cannot go to standard output")):
-        with pytest.raises(InputError, match=f"{name}: expected the name of a file.*{what}"):
+        with pytest.raises(InputError, match=f"{name}: expected a file.*{what}"):
             Spool(Path(name), b"head", lambda: Piece(b"", 0, False))
     assert stat.S_ISFIFO(os.stat("pipe").st_mode)
     assert not os.path.lexists("-")
