@@ -7,7 +7,6 @@ import tempfile
 import time
 from collections.abc import Sequence
 from datetime import UTC, datetime
-from importlib import resources
 from pathlib import Path
 from threading import Thread
 from typing import Final
@@ -113,20 +112,21 @@ def run(
     if is_there:
         session = Session.open(folder)
     else:
-        plan = procedures.load(procedure or PROCEDURE)
+        plan = procedures.load_file(procedure or PROCEDURE)
         if rehearsal is not None:
-            port, calibration, site = rehearsal.make(plan)
+            port, calibration, site = rehearsal.make(plan.model)
             profile = profile or REHEARSED
         if port is None or profile is None or calibration is None or site is None:
             raise InputError("a new session: expected --port, --profile, --calibration and --site")
-        worst_mm = float(predicted(plan, config.read(site, Site)).differences_sigma.max()) / MM
+        place = config.read_file(site, Site)
+        worst_mm = float(predicted(plan.model, place.model).differences_sigma.max()) / MM
         expected = f"session {folder}: the differences are expected to 1 sigma of {worst_mm:.3f} mm"
         console.print(expected, markup=False, soft_wrap=True)
         session = Session.create(
             folder,
-            procedure=_procedure_document(procedure or PROCEDURE),
+            procedure=_document(procedure or PROCEDURE, plan.content),
             calibration=calibration,
-            site=_document(site),
+            site=_document(site, place.content),
             profile=profile,
             port=port,
         )
@@ -304,9 +304,9 @@ def _require_resumable(
         raise InputError(f"{session.folder}: the session is over, see {REPORT} in it; name another folder")
     session.require_whole()
     session.require_same(
-        procedure=_procedure_document(procedure) if procedure else None,
+        procedure=_document(procedure, procedures.load_file(procedure).content) if procedure else None,
         calibration=calibration,
-        site=_document(site) if site else None,
+        site=_document(site, config.read_file(site, Site).content) if site else None,
         profile=profile or session.plan.profile.name,
     )
 
@@ -324,14 +324,5 @@ def _resume(session: Session, console: Console, redo: Sequence[str], asks: bool)
     session.append({"event": "resumed", "left": left})
 
 
-def _procedure_document(name: str) -> Document:
-    if name in procedures.shipped():
-        return Document(name, (resources.files("calib") / "procedures" / f"{name}.yaml").read_text("utf-8"))
-    return _document(Path(name))
-
-
-def _document(path: Path) -> Document:
-    try:
-        return Document(str(path), path.read_text("utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read: {error}") from error
+def _document(name: str | Path, content: bytes) -> Document:
+    return Document(str(name), content.decode())

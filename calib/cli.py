@@ -37,7 +37,7 @@ from calib.trials import TRIALS, askew, campaign, dithering
 from calib.validate import RATE_FILTER, Judged, Setting, Trial, judge, navigate
 from calib.validation_report import document
 from imudrv import config, profiles
-from imudrv.calibration import Calibration, read_calibration
+from imudrv.calibration import Calibration, read_calibration, read_calibration_file
 from imudrv.captures import Capture
 from imudrv.config import Model
 from imudrv.console import BAD_INPUT, OK, CommandLine, progress
@@ -379,8 +379,8 @@ def _wanted(arms: Arms, gauge: Gauge | None, stated: Stated | None) -> Arms:
 def _basis(arguments: argparse.Namespace) -> Basis:
     """The calibration given, or the one that the recordings agree on."""
     if arguments.calibration is not None:
-        calibration = read_calibration(arguments.calibration, arguments.unit)
-        return Basis(calibration, arguments.calibration.name, config.sha256(arguments.calibration))
+        file = read_calibration_file(arguments.calibration, arguments.unit)
+        return Basis(file.model, arguments.calibration.name, file.sha256)
     texts: dict[str, str] = {}
     for path in arguments.captures:
         text = Recording(path).calibration_text if path.suffix == ".mcap" else None
@@ -404,20 +404,20 @@ def _basis(arguments: argparse.Namespace) -> Basis:
 
 def _gauge(arguments: argparse.Namespace) -> None:
     _check_output(arguments.output, arguments.file)
-    calibration = read_calibration(arguments.file)
-    before = arms_of(calibration, str(arguments.file))
+    file = read_calibration_file(arguments.file)
+    before = arms_of(file.model, str(arguments.file))
     stated = _stated(arguments.at)
     arms = convert(before, arguments.gauge, stated)
     how: dict[str, Any] = {
         "from": before.gauge,
         "to": arms.gauge,
-        "file_sha256": config.sha256(arguments.file),
+        "file_sha256": file.sha256,
     }
     if stated is not None:
         how["stated_mm"] = {stated[0]: [value / MM for value in stated[1]]}
-    write(arguments.output, with_arms(calibration, arms, CHANGED, how))
+    write(arguments.output, with_arms(file.model, arms, CHANGED, how))
     print(arms_text(arms), end="")
-    print(_written(arguments.output, calibration, arms))
+    print(_written(arguments.output, file.model, arms))
 
 
 def _export_arms(arguments: argparse.Namespace) -> None:
@@ -435,10 +435,12 @@ def _import_arms(arguments: argparse.Namespace) -> None:
     _check_output(arguments.output, arguments.file, arguments.calibration)
     calibration = read_calibration(arguments.calibration)
     if arguments.program == "kalibr":
-        arms = from_kalibr(config.read(arguments.file, _Kalibr).imu0)
+        file = config.read_file(arguments.file, _Kalibr)
+        arms, digest = from_kalibr(file.model.imu0), file.sha256
     else:
-        arms = from_psins(_clbt(arguments.file))
-    how = {"method": f"imported from {arguments.program}", "file_sha256": config.sha256(arguments.file)}
+        content = config.content(arguments.file)
+        arms, digest = from_psins(_clbt(content, arguments.file)), sha256(content).hexdigest()
+    how = {"method": f"imported from {arguments.program}", "file_sha256": digest}
     write(arguments.output, with_arms(calibration, arms, FOUND, how))
     print(arms_text(arms), end="")
     print(_written(arguments.output, calibration, arms))
@@ -492,12 +494,9 @@ class _Kalibr(Model):
     imu0: dict[str, JsonValue]
 
 
-def _clbt(path: Path) -> dict[str, list[float]]:
+def _clbt(content: bytes, path: Path) -> dict[str, list[float]]:
     """Rows of MATLAB text, m: `clbt.rx = [...]` of a program is in m, `rx = [...]` of `clbtfile` in cm."""
-    try:
-        text = path.read_text(encoding="utf-8", errors="replace")
-    except OSError as error:
-        raise InputError(f"{path}: expected MATLAB text, cannot read it: {error.strerror}") from error
+    text = content.decode("utf-8", errors="replace")
     rows = {}
     for prefix, name, row in re.findall(r"^\s*(clbt\.)?(r[xyz])\s*=\s*\[([^\]]*)\]", text, re.MULTILINE):
         try:

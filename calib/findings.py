@@ -19,7 +19,7 @@ from calib.runs import Evidence, Priors, Run, collect
 from calib.segments import Limits
 from imudrv.calibration import Calibration, coefficients
 from imudrv.captures import Capture
-from imudrv.config import sha256
+from imudrv.config import sha256, unchanged
 from imudrv.errors import InputError
 from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import rate_filter
@@ -269,14 +269,16 @@ def _read(
         yield compensator.close()
 
     try:
-        evidence = collect(increments, known.C_ba, site, label=label, limits=limits, priors=priors)
+        with unchanged(path):  # two passes, and one for the hash
+            evidence = collect(increments, known.C_ba, site, label=label, limits=limits, priors=priors)
+            digest = sha256(path)
     except InputError as error:
         raise error if str(path) in str(error) else InputError(f"{path}: {error}") from None
     names = capture.layout.temperature_names
     return Source(
         label,
         path.name,
-        sha256(path),
+        digest,
         capture.layout.name,
         str(capture.tracker.counts),
         tuple(

@@ -21,7 +21,7 @@ from calib import segments
 from calib.identify import Planned, Prediction, predict
 from calib.runs import Priors
 from calib.segments import Noise
-from imudrv.config import Model, read
+from imudrv.config import Model, SettingsFile, read_file
 from imudrv.errors import InputError
 from imudrv.nav.alignment import MAX_ALIGNMENT_S, MIN_ALIGNMENT_S
 from imudrv.site import Site
@@ -271,15 +271,20 @@ def load(name_or_path: str) -> Procedure:
     InputError
         No such procedure, or one with faults; all faults at once.
     """
+    return load_file(name_or_path).model
+
+
+def load_file(name_or_path: str) -> SettingsFile[Procedure]:
+    """Load a procedure with the content of its file; see `load`."""
     if name_or_path in shipped():
         with resources.as_file(resources.files("calib") / "procedures" / f"{name_or_path}.yaml") as path:
-            return read(path, Procedure)
+            return read_file(path, Procedure)
     if not Path(name_or_path).exists():
         raise InputError(
             f"procedure {name_or_path!r}: expected one of {', '.join(shipped())}, "
             "or the path of a procedure file; there is no such file"
         )
-    return read(name_or_path, Procedure)
+    return read_file(name_or_path, Procedure)
 
 
 def vector(axis: Side) -> Array:

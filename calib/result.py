@@ -225,12 +225,14 @@ def _mean(run: Run, rest: np.ndarray, rows: slice) -> np.ndarray:
 def _source(
     procedure: Procedure, attempt: Attempt, known: Coefficients, site: Site, priors: Priors
 ) -> Source:
-    heard = _hear(attempt)
+    with config.unchanged(attempt.recording):
+        heard = _hear(attempt)
+        digest = config.sha256(attempt.recording)
     degc = heard.pulses["temperature_degc"]
     return Source(
         attempt.recording.stem,
         attempt.recording.name,
-        config.sha256(attempt.recording),
+        digest,
         heard.layout.name,
         str(heard.counts),
         tuple(

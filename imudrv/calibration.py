@@ -12,7 +12,7 @@ from pydantic import AfterValidator, JsonValue, model_validator
 from pydantic import Field as Key
 
 from imudrv.arrays import Array
-from imudrv.config import Matrix3, Model, UtcTime, read, write
+from imudrv.config import Matrix3, Model, SettingsFile, UtcTime, read_file, write
 from imudrv.errors import InputError
 from imudrv.imu.coefficients import Coefficients, TemperatureTerms
 from imudrv.units import ARCSEC, DEG_PER_H, MM, PPM, UG
@@ -269,9 +269,26 @@ def read_calibration(path: str | os.PathLike[str], unit: str | None = None) -> C
     InputError
         The file cannot be read, has faults, or is the certificate of another unit.
     """
-    calibration = read(path, Calibration)
-    require_unit(calibration, unit, os.fspath(path))
-    return calibration
+    return read_calibration_file(path, unit).model
+
+
+def read_calibration_file(path: str | os.PathLike[str], unit: str | None = None) -> SettingsFile[Calibration]:
+    """Read a calibration together with its content and SHA-256; see `read_calibration`.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    unit : str, optional
+        Serial number of the unit that is connected; not given: any.
+
+    Returns
+    -------
+    SettingsFile of Calibration
+    """
+    file = read_file(path, Calibration)
+    require_unit(file.model, unit, os.fspath(path))
+    return file
 
 
 def require_unit(calibration: Calibration, unit: str | None, name: str) -> None:

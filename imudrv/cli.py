@@ -5,15 +5,16 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from signal import SIGHUP
 from typing import TextIO
 
 from rich.console import Console
 
 from imudrv import config, profiles, settings
-from imudrv.calibration import Calibration, coefficients, read_calibration, require_unit
+from imudrv.calibration import Calibration, coefficients, read_calibration_file, require_unit
 from imudrv.captures import Capture
 from imudrv.config import Model
-from imudrv.console import BAD_INPUT, OK, CommandLine, progress
+from imudrv.console import BAD_INPUT, INTERRUPTED, OK, CommandLine, progress
 from imudrv.demo import demo
 from imudrv.doctor import doctor
 from imudrv.errors import InputError
@@ -22,6 +23,8 @@ from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import NAMES, rate_filter
 from imudrv.monitor import monitor
 from imudrv.outputs import is_standard_output, require_other
+from imudrv.printer import Printer
+from imudrv.process import Signals
 from imudrv.profiles import Profile
 from imudrv.recording import Recording, pack
 from imudrv.service import Service
@@ -188,8 +191,8 @@ def _compensate(arguments: argparse.Namespace) -> None:
     require_other(arguments.output, arguments.capture, arguments.profile, arguments.calibration)
     capture = _capture(arguments)
     if arguments.calibration is not None:
-        calibration = read_calibration(arguments.calibration, arguments.unit)
-        origin = f"calibration {config.sha256(arguments.calibration)[:12]}"
+        file = read_calibration_file(arguments.calibration, arguments.unit)
+        calibration, origin = file.model, f"calibration {file.sha256[:12]}"
     elif capture.recording is not None and (recorded := capture.recording.calibration) is not None:
         require_unit(recorded, arguments.unit, str(arguments.capture))
         calibration, origin = recorded, "calibration of the recording"
@@ -258,13 +261,25 @@ def _play(arguments: argparse.Namespace) -> None:
     profile = profiles.load(arguments.profile)
     scenario = scenarios.load(arguments.scenario)
     speed = speed_of(arguments.speed or "1")
-    print(play(scenario, profile, arguments.port, speed, _say, arguments.link))
+    with Printer(sys.stdout) as printer:
+        printer.say(str(play(scenario, profile, arguments.port, speed, printer.say, arguments.link)))
+    if printer.failure:
+        raise InputError(printer.failure)
 
 
-def _run(arguments: argparse.Namespace) -> None:
+def _run(arguments: argparse.Namespace) -> int:
+    signals = Signals()
     names = set(Settings.model_fields) - {"format", "version"}
     given = {name: getattr(arguments, name) for name in names}
-    Service(settings.load(arguments.settings, given), _say, warn=_warn).run()
+    with signals.caught(SIGHUP), Printer(sys.stdout) as printer, Printer(sys.stderr) as warnings:
+        Service(
+            settings.load(arguments.settings, given),
+            printer.say,
+            warn=warnings.say,
+            signals=signals,
+            notices=lambda: [*printer.notices(), *warnings.notices()],
+        ).run()
+    return INTERRUPTED if signals.hung_up else OK
 
 
 def _monitor(arguments: argparse.Namespace) -> None:
@@ -298,10 +313,6 @@ def _export(arguments: argparse.Namespace) -> None:
 
 def _say(text: str) -> None:
     print(text, flush=True)
-
-
-def _warn(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
 
 
 def _check(arguments: argparse.Namespace) -> None:

@@ -15,11 +15,12 @@ import secrets
 import stat
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from io import BufferedReader
 from itertools import chain, count, takewhile
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, TypeAlias, TypeVar, get_args, get_origin
+from typing import Annotated, Any, Final, Generic, Literal, TypeAlias, TypeVar, get_args, get_origin
 
 import yaml
 from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, ValidationError
@@ -61,6 +62,43 @@ Matrix3: TypeAlias = tuple[Vector3, Vector3, Vector3]
 M = TypeVar("M", bound=Model)
 
 
+@dataclass(frozen=True)
+class SettingsFile(Generic[M]):
+    """A settings file as one read found it; whatever happens to the file, the three agree.
+
+    Attributes
+    ----------
+    content : bytes
+        The file as it is.
+    sha256 : str
+        SHA-256 of the content, 64 hexadecimal digits.
+    model : Model
+        The content, checked.
+    """
+
+    content: bytes
+    sha256: str
+    model: M
+
+
+def read_file(path: str | os.PathLike[str], model: type[M]) -> SettingsFile[M]:
+    """Read and check a settings file, and keep its content; see `read`.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    model : subclass of Model
+        What it should be.
+
+    Returns
+    -------
+    SettingsFile
+    """
+    data = content(path)
+    return SettingsFile(data, hashlib.sha256(data).hexdigest(), parse_text(data, model, os.fspath(path)))
+
+
 def read(path: str | os.PathLike[str], model: type[M]) -> M:
     """Read and check a settings file.
 
@@ -82,7 +120,7 @@ def read(path: str | os.PathLike[str], model: type[M]) -> M:
     FaultyFileError
         It is no YAML, or not what the model says; all faults at once.
     """
-    return parse_text(_content(Path(path)), model, os.fspath(path))
+    return read_file(path, model).model
 
 
 def parse_text(text: bytes, model: type[M], name: str) -> M:
@@ -153,7 +191,7 @@ def kind(path: str | os.PathLike[str]) -> str:
         The file cannot be read, is no YAML, or does not say what it is.
     """
     name = os.fspath(path)
-    document = _load(_content(Path(path)), name)
+    document = _load(content(path), name)
     if not isinstance(document, dict):
         raise FaultyFileError(name, [f"expected a mapping (key: value), got {_shown(document)}"])
     if "format" not in document and "latitude_deg" in document:
@@ -197,8 +235,35 @@ def write(path: str | os.PathLike[str], document: Model | Mapping[str, object]) 
     _load(data, str(path))  # what is written can be read
     with _plain_words(path, "written", f"expected the folder {path.parent}, there is none; make it first"):
         if target.exists():
-            _replace(_kept_name(target), _content(target))
+            _replace(_kept_name(target), content(target))
         _replace(target, data)
+
+
+def content(path: str | os.PathLike[str]) -> bytes:
+    """Read a settings file as it is.
+
+    Parameters
+    ----------
+    path : path-like
+        The file, at most `MAX_BYTES`.
+
+    Returns
+    -------
+    bytes
+
+    Raises
+    ------
+    InputError
+        It cannot be read or is too large.
+    """
+    path = Path(path)
+    with _reading(path), _open(path) as file:
+        data = file.read(MAX_BYTES + 1)
+    if len(data) > MAX_BYTES:
+        raise InputError(
+            f"{path}: expected a settings file of at most {MAX_BYTES} bytes, got more; is it another file?"
+        )
+    return data
 
 
 def sha256(path: str | os.PathLike[str]) -> str:
@@ -222,6 +287,49 @@ def sha256(path: str | os.PathLike[str]) -> str:
     path = Path(path)
     with _reading(path), _open(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def change_mark(path: str | os.PathLike[str]) -> tuple[int, int, int]:
+    """Time of modification (ns), size (bytes) and inode of a file: another mark, another content.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+
+    Returns
+    -------
+    tuple of int
+        Zeros if there is no such file.
+    """
+    try:
+        found = os.stat(path)
+    except (OSError, ValueError):  # ValueError: a NUL in the path
+        return 0, 0, 0
+    return found.st_mtime_ns, found.st_size, found.st_ino
+
+
+@contextmanager
+def unchanged(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Watch a file that is read in several passes.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+
+    Raises
+    ------
+    InputError
+        At the end: it was changed or replaced meanwhile.
+    """
+    before = change_mark(path)
+    yield
+    if change_mark(path) != before:
+        raise InputError(
+            f"{os.fspath(path)}: expected a file that stays as it is, it was changed while it was read; "
+            "wait until it is complete, then try again"
+        )
 
 
 # Files
@@ -250,16 +358,6 @@ def _open(path: Path) -> BufferedReader:
     if not stat.S_ISREG(path.stat().st_mode):
         raise InputError(f"{path}: expected a file, got a {'folder' if path.is_dir() else 'device or pipe'}")
     return path.open("rb")
-
-
-def _content(path: Path) -> bytes:
-    with _reading(path), _open(path) as file:
-        data = file.read(MAX_BYTES + 1)
-    if len(data) > MAX_BYTES:
-        raise InputError(
-            f"{path}: expected a settings file of at most {MAX_BYTES} bytes, got more; is it another file?"
-        )
-    return data
 
 
 def _replace(path: Path, data: bytes) -> None:

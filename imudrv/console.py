@@ -64,7 +64,8 @@ def guarded(command: Callable[[], int | None]) -> int:
     console = Console(stderr=True, highlight=False, soft_wrap=True)
     try:
         code = command()
-        sys.stdout.flush()
+        if sys.stdout is not None:  # as it is in a process that was started with it closed
+            sys.stdout.flush()
     except InputError as error:
         console.print(f"error: {error}", markup=False)
         return BAD_INPUT

@@ -54,23 +54,31 @@ class Signals:
     """SIGTERM and SIGINT end the loop, SIGHUP makes it read the calibration again; seen at its next turn.
 
     A SIGHUP because the terminal has gone ends it too: nobody is there any more.
+
+    Attributes
+    ----------
+    stop, reload : bool
+        Requested: the end, and that the calibration is read again.
+    hung_up : bool
+        Whether the end is due to the terminal and not to a request.
     """
 
     def __init__(self) -> None:
         self.stop = False
         self.reload = False
+        self.hung_up = False
         self._has_terminal = os.isatty(0)
 
     def _handle(self, number: int, _: object) -> None:
         if number == signal.SIGHUP and os.isatty(0) == self._has_terminal:
             self.reload = True
-        else:
+        elif not self.stop:
             self.stop = True
+            self.hung_up = number == signal.SIGHUP
 
     @contextmanager
-    def caught(self) -> Iterator[None]:
-        """Handle them while inside."""
-        numbers = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+    def caught(self, *numbers: signal.Signals) -> Iterator[None]:
+        """Handle these while inside."""
         before = {number: signal.signal(number, self._handle) for number in numbers}
         try:
             yield

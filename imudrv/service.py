@@ -15,13 +15,14 @@ from contextlib import ExitStack
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
+from signal import SIGHUP, SIGINT, SIGTERM
 from threading import Thread
 from typing import Final
 
 import numpy as np
 
 from imudrv import config, profiles
-from imudrv.calibration import Calibration, coefficients, read_calibration
+from imudrv.calibration import Calibration, coefficients, read_calibration_file
 from imudrv.diagnosis import LineState, LineWatch
 from imudrv.errors import InputError
 from imudrv.hostclock import now_ns
@@ -58,7 +59,7 @@ class Service:
     settings : Settings
         What to do.
     say : callable
-        Told each event in a line.
+        Told each event in a line; must not block.
     sinks : sequence of Sink
         More ways out than the settings have.
     warn : callable, optional
@@ -67,6 +68,10 @@ class Service:
         False for a simulated unit at a port, whose rate depends on its speed and is not judged.
     history : History, optional
         Filled by the loop, for recordings that begin in the past.
+    signals : Signals, optional
+        Given by a caller that handles some signals before `run` does.
+    notices : callable, optional
+        Returns further warnings for the status, a sentence each.
 
     Raises
     ------
@@ -83,22 +88,25 @@ class Service:
         warn: Callable[[str], None] | None = None,
         in_real_time: bool = True,
         history: History | None = None,
+        signals: Signals | None = None,
+        notices: Callable[[], list[str]] = list,
     ) -> None:
         self._settings = settings
         self._say, self._warn = say, warn or say
-        self._profile = profiles.load(settings.profile)
+        self._more_notices = notices
+        self._profile_file = profiles.load_file(settings.profile)
+        self._profile = self._profile_file.model
         self._layout = self._profile.layout()
         self._calibration_path = Path(settings.calibration)
-        self._calibration = read_calibration(self._calibration_path, settings.unit)
-        self._calibration_sha256 = config.sha256(self._calibration_path)
-        self._calibration_seen = self._calibration_mark()
+        self._calibration_seen = config.change_mark(self._calibration_path)
+        self._calibration = read_calibration_file(self._calibration_path, settings.unit)
         self._calibration_refused = ""
         self._exchanges = 0
         check_url(settings.port, self._profile)
         self._rates = rate_filter(settings.rate_filter, self._layout.interval_ns)
-        self._pipeline = Pipeline(self._profile, coefficients(self._calibration), self._rates)
+        self._pipeline = Pipeline(self._profile, coefficients(self._calibration.model), self._rates)
         self._latency = Latency(self._layout.interval_ns)
-        self._signals = Signals()
+        self._signals = signals or Signals()
         self._history = history
         self._switches: deque[tuple[Path | None, int | None, Future[None]]] = deque()
         self._has_ended = False
@@ -139,12 +147,12 @@ class Service:
         if self._settings.realtime and (refusal := ask_realtime()):
             self._notices.append(refusal)
             self._failure(refusal)
-        warm_up(self._profile, self._calibration, self._settings)
-        with self._signals.caught(), quiet_memory():
+        warm_up(self._profile, self._calibration.model, self._settings)
+        with self._signals.caught(SIGTERM, SIGINT, SIGHUP), quiet_memory():
             try:
                 self._refresh(now_ns())
                 self._manager.tell("READY=1")
-                self._event(f"serving {self._settings.port}, calibration {self._calibration_sha256[:12]}")
+                self._event(f"serving {self._settings.port}, calibration {self._calibration.sha256[:12]}")
                 self._serve()
             finally:
                 self._manager.tell("STOPPING=1")
@@ -304,36 +312,28 @@ class Service:
             self._recorder.status(status)
 
     def _look_at_calibration(self) -> None:
-        mark = self._calibration_mark()
+        mark = config.change_mark(self._calibration_path)
         if not self._signals.reload and mark == self._calibration_seen:
             return
         self._signals.reload = False
         self._calibration_seen = mark
         try:
-            calibration = read_calibration(self._calibration_path, self._settings.unit)
-            sha256 = config.sha256(self._calibration_path)
+            calibration = read_calibration_file(self._calibration_path, self._settings.unit)
         except InputError as error:
             self._calibration_refused = str(error)
             self._failure(f"calibration refused, the old one stays: {error}")
             return
         self._calibration_refused = ""
-        if sha256 == self._calibration_sha256:
+        if calibration.sha256 == self._calibration.sha256:
             return
-        self._calibration, self._calibration_sha256 = calibration, sha256
+        self._calibration = calibration
         self._exchanges += 1
-        self._pipeline.exchange(coefficients(calibration))
+        self._pipeline.exchange(coefficients(calibration.model))
         if self._recorder is not None:
-            self._recorder.calibration(now_ns(), self._calibration_path.read_bytes())
+            self._recorder.calibration(now_ns(), calibration.content)
         if self._history is not None:
             self._history.clear()  # a recording begins with one calibration
-        self._event(f"calibration exchanged: {sha256[:12]}")
-
-    def _calibration_mark(self) -> tuple[int, int, int]:
-        try:
-            found = self._calibration_path.stat()
-        except OSError:
-            return 0, 0, 0
-        return found.st_mtime_ns, found.st_size, found.st_ino
+        self._event(f"calibration exchanged: {calibration.sha256[:12]}")
 
     def _failure(self, text: str) -> None:
         self._event(text, self._warn)
@@ -373,11 +373,11 @@ class Service:
         return Recorder(
             path,
             layout=self._layout,
-            profile=profiles.content(self._settings.profile),
-            calibration=self._calibration_path.read_bytes(),
+            profile=self._profile_file.content,
+            calibration=self._calibration.content,
             source=self._source,
             port=self._settings.port,
-            unit=self._calibration.serial_number,
+            unit=self._calibration.model.serial_number,
         )
 
     def _finish(self) -> None:
@@ -430,10 +430,10 @@ class Service:
                 "source": self._source.name.lower(),
             },
             "profile": self._profile.name,
-            "unit": self._calibration.serial_number,
+            "unit": self._calibration.model.serial_number,
             "calibration": {
                 "path": str(self._calibration_path),
-                "sha256": self._calibration_sha256,
+                "sha256": self._calibration.sha256,
                 "exchanges": self._exchanges,
                 "refused": self._calibration_refused,
             },
@@ -466,7 +466,11 @@ class Service:
                 "dv_b": increments["dv_b"].tolist(),
                 "flags": [flag.name for flag in Flag if flag & int(increments["flags"])],
             },
-            "notices": [*self._notices, *([self._calibration_refused] if self._calibration_refused else [])],
+            "notices": [
+                *self._notices,
+                *([self._calibration_refused] if self._calibration_refused else []),
+                *self._more_notices(),
+            ],
             "events": self._events,
         }
         status["health"], status["reasons"] = health(status)

@@ -1,8 +1,15 @@
+import random
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
+from threading import Event, Thread
+from typing import TypeAlias
 
 import pytest
 
 _DATA = Path(__file__).parents[2] / "shared" / "data"
+ReplacedAtRandom: TypeAlias = Callable[..., AbstractContextManager[None]]
 
 
 @pytest.fixture(scope="session")
@@ -17,3 +24,38 @@ def data() -> Path:
 def reference(data: Path) -> Path:
     """The folder of the reference captures and what belongs to them."""
     return data / "reference"
+
+
+@contextmanager
+def _replaced_at_random(
+    path: Path, contents: Sequence[bytes], seed: int, removed: float = 0.0
+) -> Iterator[None]:
+    """Inside, a file becomes one of the contents again and again, each time whole; `removed`: how often it is
+    away for a moment before.
+    """
+    is_over = Event()
+    randomly = random.Random(seed)
+    beside = path.with_name("next")
+
+    def replace() -> None:
+        while not is_over.is_set():
+            beside.write_bytes(randomly.choice(contents))
+            if randomly.random() < removed:
+                path.unlink()
+                time.sleep(randomly.uniform(0.0, 2e-3))
+            beside.rename(path)
+            time.sleep(randomly.uniform(0.0, 4e-3))  # reading, parsing and hashing takes about as long
+
+    thread = Thread(target=replace)
+    thread.start()
+    try:
+        yield
+    finally:
+        is_over.set()
+        thread.join()
+
+
+@pytest.fixture(scope="session")
+def replaced_at_random() -> ReplacedAtRandom:
+    """Replaces a file while it is read; see `_replaced_at_random`."""
+    return _replaced_at_random

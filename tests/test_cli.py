@@ -1,15 +1,20 @@
 """The commands as a user runs them: real processes, real files, exit codes and messages."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from imudrv.cli import main
 from imudrv.wire.datagram import DatagramDecoder
 
 ROOT = Path(__file__).parents[1]
@@ -175,6 +180,22 @@ def test_a_users_mistake_is_one_message_and_exit_code_2(arguments: list[str], sa
     assert "Traceback" not in done.stderr
     assert not list(bench.glob("o.*"))
     assert not list(bench.glob(".o.*"))
+
+
+def test_compensate_names_the_calibration_that_it_used(
+    bench: Path,
+    capsys: pytest.CaptureFixture[str],
+    replaced_at_random: Callable[..., AbstractContextManager[None]],
+) -> None:
+    other = CALIBRATION.replace("50-0017", "50-0018").encode()
+    short = {sha256(text).hexdigest()[:12]: text for text in (CALIBRATION.encode(), other)}
+    (bench / "replaced.yaml").write_text(CALIBRATION)
+    command = ["compensate", str(bench / "run.raw"), "--profile", "imu50-rs422", "-o", str(bench / "r.npz")]
+    with replaced_at_random(bench / "replaced.yaml", list(short.values()), seed=3):
+        for _ in range(30):
+            assert main([*command, "--calibration", str(bench / "replaced.yaml")]) == 0
+            (used,) = re.findall(r"unit (\S+), calibration (\w+)", capsys.readouterr().out)
+            assert used[0].encode() in short[used[1]]
 
 
 def test_check_knows_every_kind_of_file(bench: Path) -> None:

@@ -1,10 +1,12 @@
 import contextlib
 import errno
+import hashlib
 import math
 import os
 import re
 import struct
 import tempfile
+from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -15,7 +17,19 @@ from hypothesis import strategies as st
 from pydantic import Field, JsonValue
 
 from imudrv import config
-from imudrv.config import Matrix3, Model, UtcTime, Vector3, kind, parse, read, sha256, write
+from imudrv.config import (
+    Matrix3,
+    Model,
+    UtcTime,
+    Vector3,
+    kind,
+    parse,
+    read,
+    read_file,
+    sha256,
+    unchanged,
+    write,
+)
 from imudrv.errors import FaultyFileError, InputError
 
 
@@ -440,6 +454,29 @@ def test_a_file_that_does_not_say_what_it_is_is_refused(file: Path) -> None:
 def test_the_hash_is_the_published_one(file: Path) -> None:
     file.write_bytes(b"abc")  # FIPS 180-2, appendix B.1
     assert sha256(file) == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+
+
+def test_content_hash_and_model_are_of_one_read(
+    file: Path, replaced_at_random: Callable[..., contextlib.AbstractContextManager[None]]
+) -> None:
+    texts = {n: f"format: test-settings\nversion: 1\ncount: {n}\n".encode() for n in (1, 2)}
+    file.write_bytes(texts[1])
+    with replaced_at_random(file, list(texts.values()), seed=1):
+        for _ in range(200):
+            found = read_file(file, Settings)
+            assert found.content == texts[found.model.count]
+            assert found.sha256 == hashlib.sha256(found.content).hexdigest()
+
+
+@pytest.mark.parametrize(
+    "change", [Path.unlink, lambda file: os.truncate(file, 1), lambda file: os.utime(file)]
+)
+def test_a_file_that_is_read_twice_must_stay_the_same(file: Path, change: Callable[[Path], None]) -> None:
+    file.write_bytes(b"abc")
+    with unchanged(file):
+        sha256(file)
+    with pytest.raises(InputError, match="it was changed while it was read; wait"), unchanged(file):
+        change(file)
 
 
 # Writing

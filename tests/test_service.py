@@ -8,25 +8,34 @@ import signal
 import socket
 import subprocess
 import sys
+import termios
 import threading
 import time
 import tty
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
+from hashlib import sha256
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike, NDArray
 
 from imudrv.calibration import write_calibration
+from imudrv.console import INTERRUPTED
+from imudrv.errors import InputError
+from imudrv.hostclock import now_ns
 from imudrv.profiles import load
 from imudrv.receive import receive
 from imudrv.recording import Recording
 from imudrv.records import PULSES, Flag
+from imudrv.service import Service as Driver
+from imudrv.settings import Settings
 from imudrv.sim.scenario import NOMINAL
 from imudrv.status import ask
+from imudrv.units import ARCSEC
 from imudrv.wire.encode import StreamEncoder
 
 LAYOUT = load("imu50-rs422").layout()
@@ -35,12 +44,17 @@ DEADLINE_S = 60.0
 
 def frames(first: int, count: int) -> bytes:
     """Frames of a unit that turns a little."""
-    pulses = np.zeros(count, PULSES)
-    pulses["counter"] = first + np.arange(count)
-    pulses["gyro"] = np.rint(100.0 * np.sin(pulses["counter"] / 50.0))[:, None]
-    pulses["accelerometer"] = [0, 0, 20]
-    pulses["temperature_degc"] = 35.0
-    return StreamEncoder(LAYOUT).encode(pulses).tobytes()
+    samples = np.zeros(count, PULSES)
+    samples["counter"] = first + np.arange(count)
+    samples["gyro"] = pulses(samples["counter"])[:, None]
+    samples["accelerometer"] = [0, 0, 20]
+    samples["temperature_degc"] = 35.0
+    return StreamEncoder(LAYOUT).encode(samples).tobytes()
+
+
+def pulses(counter: ArrayLike) -> NDArray[np.float64]:
+    """What each gyro of that unit counts in a sample."""
+    return np.rint(100.0 * np.sin(np.asarray(counter) / 50.0))
 
 
 def until(true: Callable[[], object], what: str) -> None:
@@ -100,32 +114,47 @@ class Unit:
 class Service:
     """A running `imudrv run`."""
 
-    def __init__(self, folder: Path, *arguments: object, stdin: int = subprocess.DEVNULL) -> None:
+    def __init__(
+        self, folder: Path, *arguments: object, stdin: int = subprocess.DEVNULL, stdout: int = subprocess.PIPE
+    ) -> None:
         self.socket = folder / "status.sock"
         self.process = subprocess.Popen(
             [sys.executable, "-m", "imudrv", "run", *map(str, arguments), "--status", str(self.socket)],
             cwd=folder,
             stdin=stdin,
-            stdout=subprocess.PIPE,
+            stdout=stdout,
             stderr=subprocess.PIPE,
             text=True,
         )
+        self.said: list[str] = []
         self.said: list[str] = []
         self.warned: list[str] = []
         self._listeners = [
             threading.Thread(target=lines.extend, args=[stream])
             for lines, stream in ((self.said, self.process.stdout), (self.warned, self.process.stderr))
+            if stream is not None
         ]
         for listener in self._listeners:
             listener.start()
-        until(lambda: self.said or self.process.poll() is not None, "the first line")
-        assert self.heard("serving"), self.said + self.warned
+        if self.process.stdout is not None:
+            until(lambda: self.said or self.process.poll() is not None, "the first line")
+            assert self.heard("serving"), self.said + self.warned
 
     def status(self) -> dict[str, Any]:
         return ask(self.socket)
 
     def good(self) -> int:
         return int(self.status()["samples"]["good"])
+
+    def notices(self) -> str:
+        return " ".join(self.status()["notices"])
+
+    def serves(self) -> bool:
+        assert self.process.poll() is None, "it has ended"
+        try:
+            return bool(self.status())
+        except InputError:
+            return False
 
     def heard(self, words: str) -> bool:
         return any(words in line for line in [*self.said, *self.warned])
@@ -147,8 +176,10 @@ class Service:
 
 
 @contextmanager
-def serving(folder: Path, *arguments: object, stdin: int = subprocess.DEVNULL) -> Iterator[Service]:
-    service = Service(folder, *arguments, stdin=stdin)
+def serving(
+    folder: Path, *arguments: object, stdin: int = subprocess.DEVNULL, stdout: int = subprocess.PIPE
+) -> Iterator[Service]:
+    service = Service(folder, *arguments, stdin=stdin, stdout=stdout)
     try:
         yield service
     finally:
@@ -350,12 +381,152 @@ def test_a_calibration_is_exchanged_while_running_and_a_bad_one_is_refused(folde
     # The pulses have a period of 314 samples, so sums over the two halves tell the scales apart.
     again = [c for _, c in Recording(folder / "run.mcap").calibrations()]
     assert [c.gyro.scale_arcsec_per_pulse[0] for c in again] == [0.5, 1.0]
-    pulses = np.rint(100.0 * np.sin(np.arange(400) / 50.0))
-    scale = increments["dtheta_b"][:, 0][np.abs(pulses) > 0] / pulses[np.abs(pulses) > 0]
+    angle = pulses(np.arange(400))
+    scale = increments["dtheta_b"][:, 0][angle != 0] / angle[angle != 0]
     assert np.unique(np.round(scale / scale[0], 9)).tolist() == [1.0, 2.0]
 
 
-def test_it_ends_when_its_terminal_has_gone(folder: Path) -> None:
+def good_pair(folder: Path) -> dict[str, bytes]:
+    """Contents of two good certificates, by the unit's serial number: its gyros have scales of 0.5 and 1."""
+    contents = {}
+    for serial_number, scale in (("a", 0.5), ("b", 1.0)):
+        gyro = NOMINAL.gyro.model_copy(update={"scale_arcsec_per_pulse": (scale, scale, scale)})
+        update = {"serial_number": serial_number, "gyro": gyro}
+        write_calibration(folder / "other.yaml", NOMINAL.model_copy(update=update))
+        contents[serial_number] = (folder / "other.yaml").read_bytes()
+    (folder / "unit.yaml").write_bytes(contents["a"])
+    return contents
+
+
+def test_constants_and_sha256_agree_however_the_calibration_file_is_replaced(
+    folder: Path, replaced_at_random: Callable[..., AbstractContextManager[None]]
+) -> None:
+    contents = good_pair(folder)
+    units = {sha256(content).hexdigest(): serial_number for serial_number, content in contents.items()}
+    unit = Unit(folder / "unit")
+    with serving(folder, *serial(folder), "--record", "run.mcap") as service:
+        for seed in range(2):
+            exchanges = service.status()["calibration"]["exchanges"]
+            with replaced_at_random(folder / "unit.yaml", list(contents.values()), seed, removed=0.2):
+                status = service.status()
+                while status["calibration"]["exchanges"] < exchanges + 4:
+                    assert status["unit"] == units[status["calibration"]["sha256"]]
+                    unit.send(20)
+                    status = service.status()
+            left = sha256((folder / "unit.yaml").read_bytes()).hexdigest()
+            until(lambda left=left: service.status()["calibration"]["sha256"] == left, "the last file taken")
+            unit.send(200)
+            while abs(angle := pulses(unit.counter - 1)) < 50:
+                unit.send(20)
+            until(lambda: service.status()["last"]["counter"] == unit.counter - 1, "the samples")
+            scale = service.status()["last"]["dtheta_b"][0] / angle
+            assert scale / ARCSEC == pytest.approx({"a": 0.5, "b": 1.0}[units[left]], rel=1e-9)  # rounding
+        assert service.stop() == 0
+    exchanged = [t.split()[-1] for _, t in Recording(folder / "run.mcap").events() if "exchanged" in t]
+    attached = [c.serial_number for _, c in Recording(folder / "run.mcap").calibrations()]
+    short = {digest[:12]: name for digest, name in units.items()}
+    assert attached == ["a", *(short[digest] for digest in exchanged)]
+
+
+def test_at_the_start_constants_and_sha256_agree_too(
+    folder: Path, replaced_at_random: Callable[..., AbstractContextManager[None]]
+) -> None:
+    contents = good_pair(folder)
+    units = {sha256(content).hexdigest(): serial_number for serial_number, content in contents.items()}
+    settings = Settings(
+        port=str(folder / "unit"),
+        profile="imu50-rs422",
+        calibration=str(folder / "unit.yaml"),
+        status=str(folder / "socket"),
+    )
+    with replaced_at_random(folder / "unit.yaml", list(contents.values()), seed=11):
+        for _ in range(40):
+            service = Driver(settings, lambda _: None)
+            status = service.status(now_ns())
+            service.stop()
+            service.run()
+            assert status["unit"] == units[status["calibration"]["sha256"]]
+
+
+def test_a_reader_of_its_text_that_leaves_costs_the_text_alone(folder: Path) -> None:
+    unit = Unit(folder / "unit")
+    reader, stdout = os.pipe()
+    with serving(folder, *serial(folder), stdout=stdout) as service:
+        os.close(stdout)
+        assert b"serving" in os.read(reader, 1000)
+        os.close(reader)  # as `head -1` does
+        unit.send(100)
+        until(lambda: service.good() == 100, "the first samples")
+        unit.unplug()
+        until(
+            lambda: "stdout: cannot be written: Broken pipe; lost lines: " in service.notices(), "a warning"
+        )
+        unit.plug()
+        unit.send(100)
+        until(lambda: service.good() == 200, "the other samples")
+        assert service.stop() == 0
+
+
+def test_a_full_disk_under_its_text_costs_the_text_alone(folder: Path) -> None:
+    unit = Unit(folder / "unit")
+    with open("/dev/full", "w") as full, serving(folder, *serial(folder), stdout=full.fileno()) as service:
+        until(service.serves, "the status")
+        unit.send(100)
+        until(lambda: service.good() == 100, "the samples")
+        assert "stdout: cannot be written: No space left on device; lost lines: 1" in service.notices()
+        assert service.stop() == 0
+
+
+def test_a_stopped_terminal_holds_its_text_alone(folder: Path) -> None:
+    unit = Unit(folder / "unit")
+    master, slave = pty.openpty()
+    os.set_blocking(master, False)
+    text = bytearray()
+
+    def printed(words: bytes, times: int = 1) -> bool:
+        with suppress(BlockingIOError):
+            text.extend(os.read(master, 4096))
+        return text.count(words) == times
+
+    out = f"udp://127.0.0.1:{free_port()}"
+    with (
+        receive(out, timeout_s=DEADLINE_S) as receiver,
+        serving(folder, *serial(folder), "--out", out, stdout=slave) as service,
+    ):
+        until(lambda: printed(b"serving"), "its first line")
+        termios.tcflow(slave, termios.TCOOFF)  # Ctrl-S
+        counters: list[int] = []
+        for reconnects in range(1, 4):
+            unit.send(100)
+            while len(counters) < unit.counter:
+                counters += next(receiver)["counter"].tolist()
+            unit.unplug()
+            until(lambda: service.status()["port"]["state"] == "lost", "the loss")
+            unit.plug()
+            until(lambda n=reconnects: service.status()["port"]["reconnects"] == n, "the port again")
+        until(lambda: "stdout: takes no text" in service.notices(), "a warning")
+        assert counters == list(range(300))
+        termios.tcflow(slave, termios.TCOON)
+        until(lambda: printed(b"port is back", 3), "what was held back")
+        until(lambda: not service.notices(), "the end of the warning")
+        termios.tcflow(slave, termios.TCOOFF)
+        assert service.stop() == 0
+    os.close(master)
+    os.close(slave)
+
+
+def test_a_sighup_while_it_starts_does_not_end_it(folder: Path) -> None:
+    unit = Unit(folder / "unit")
+    with open(os.devnull) as nothing, serving(folder, *serial(folder), stdout=nothing.fileno()) as service:
+        until(service.socket.exists, "the first steps of its start")
+        service.process.send_signal(signal.SIGHUP)
+        until(service.serves, "the end of its start")
+        unit.send(100)
+        until(lambda: service.good() == 100, "the samples")
+        assert service.stop() == 0
+
+
+def test_it_ends_when_its_terminal_has_gone_and_not_as_if_somebody_had_asked(folder: Path) -> None:
     unit = Unit(folder / "unit")
     master, slave = pty.openpty()
     with serving(folder, *serial(folder), stdin=slave) as service:
@@ -363,7 +534,7 @@ def test_it_ends_when_its_terminal_has_gone(folder: Path) -> None:
         unit.send(100)
         until(lambda: service.good() == 100, "the samples")
         os.close(master)
-        assert service.stop(signal.SIGHUP) == 0
+        assert service.stop(signal.SIGHUP) == INTERRUPTED
         assert service.heard("100 good")
 
 

@@ -167,6 +167,23 @@ def wait_for(own: Counted, more: int) -> None:
         sleep(0.01)
 
 
+def test_a_recording_has_the_calibration_in_use_while_its_file_is_away(tmp_path: Path) -> None:
+    write_calibration(tmp_path / "unit.yaml", NOMINAL)
+    settings = Settings(
+        port="sim://static?speed=20",
+        profile="imu50-rs422",
+        calibration=str(tmp_path / "unit.yaml"),
+        status=str(tmp_path / "socket"),
+    )
+    service = Service(settings, lambda _: None)
+    (tmp_path / "unit.yaml").unlink()
+    request = service.record(tmp_path / "run.mcap")
+    request.add_done_callback(lambda _: service.stop())
+    service.run()
+    assert request.exception() is None
+    assert Recording(tmp_path / "run.mcap").calibration == NOMINAL
+
+
 def test_a_request_that_the_end_overtakes_is_given_up(tmp_path: Path) -> None:
     write_calibration(tmp_path / "unit.yaml", NOMINAL)
     settings = Settings(

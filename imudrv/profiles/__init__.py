@@ -12,7 +12,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field as Key
 from pydantic import field_validator, model_validator
 
-from imudrv.config import Model, read
+from imudrv.config import Model, SettingsFile, read_file
 from imudrv.errors import InputError
 from imudrv.records import MAX_TEMPERATURES
 from imudrv.units import NS_PER_S
@@ -371,8 +371,13 @@ def load(name_or_path: str) -> Profile:
     InputError
         No such profile, or one with faults.
     """
+    return load_file(name_or_path).model
+
+
+def load_file(name_or_path: str) -> SettingsFile[Profile]:
+    """A profile with the content of its file; see `load`."""
     with _file(name_or_path) as path:
-        return read(path, Profile)
+        return read_file(path, Profile)
 
 
 def content(name_or_path: str) -> bytes:

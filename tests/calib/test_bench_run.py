@@ -3,11 +3,13 @@
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +21,10 @@ from calib import bench
 from calib.bench import SEED
 from calib.findings import Basis
 from calib.journal import Journal, begin
-from calib.procedure import load
+from calib.procedure import load, predicted
 from calib.rehearsal import BENCH, technician
 from calib.result import Attempt, identify
-from calib.session import JOURNAL, verify
+from calib.session import JOURNAL, Session, verify
 from imudrv import config
 from imudrv.calibration import SizeEffect, read_calibration, write_calibration
 from imudrv.config import sha256
@@ -414,6 +416,59 @@ def test_a_rehearsal_has_its_own_unit_and_a_unit_no_rehearsal(tmp_path: Path) ->
     (tmp_path / JOURNAL).touch()
     with pytest.raises(InputError, match="expected a rehearsal to go on with"):
         bench.run(folder=tmp_path, rehearse=True, console=Console())
+
+
+def test_a_recording_that_changes_while_it_is_read_gives_nothing(
+    undisturbed: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(undisturbed[0], copy)
+
+    def change_and_hash(path: Path) -> str:
+        with path.open("ab") as recording:
+            recording.write(b"more")
+        return sha256(path)
+
+    monkeypatch.setattr(config, "sha256", change_and_hash)
+    session = Session.open(copy)
+    with closing(session), pytest.raises(InputError, match=r"z-up.*mcap: .* changed while it was read"):
+        session.identify()
+
+
+def test_the_plan_holds_the_site_and_the_procedure_that_were_judged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    procedure, site, unit = (tmp_path / f"{name}.yaml" for name in ("procedure", "site", "unit"))
+    procedure.write_text(PROCEDURE)
+    site.write_text("{latitude_deg: 28.2, longitude_deg: 113.0, height_m: 60.0}\n")
+    write_calibration(unit, NOMINAL)
+    texts = procedure.read_text(), site.read_text()
+
+    def judge(*arguments: object) -> object:
+        site.write_text(texts[1].replace("28.2", "-28.2"))
+        procedure.write_text(PROCEDURE.replace("rest_s: 8", "rest_s: 9"))
+        return predicted(*arguments)
+
+    class CreatedError(Exception):
+        """Far enough."""
+
+    def create(folder: Path, **about: Any) -> None:
+        raise CreatedError(about["procedure"].text, about["site"].text)
+
+    monkeypatch.setattr(bench, "predicted", judge)
+    monkeypatch.setattr(Session, "create", create)
+    with pytest.raises(CreatedError) as created:
+        bench.run(
+            port="/dev/ttyUSB0",
+            profile="imu50-rs422",
+            calibration=unit,
+            site=site,
+            procedure=str(procedure),
+            folder=tmp_path / "new",
+            hands_free=True,
+            console=Console(),
+        )
+    assert created.value.args == texts
 
 
 def test_a_new_session_wants_the_units_papers(tmp_path: Path) -> None:

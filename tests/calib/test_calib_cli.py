@@ -4,6 +4,9 @@ import json
 import re
 import subprocess
 import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +14,14 @@ import pytest
 import yaml
 
 from calib.cli import main
-from imudrv.calibration import write_calibration
+from calib.findings import Basis, find
+from imudrv import config
+from imudrv.calibration import read_calibration_file, write_calibration
 from imudrv.cli import main as imudrv
+from imudrv.errors import InputError
+from imudrv.profiles import load as load_profile
 from imudrv.sim.scenario import NOMINAL
+from imudrv.site import Site
 
 SITE = "{latitude_deg: 28.2, longitude_deg: 113.0, height_m: 60.0}"
 SCENARIO = """
@@ -180,6 +188,65 @@ def test_a_reader_who_leaves_early_does_not_cost_the_certificate(here: Path) -> 
     command = f"{sys.executable} -m calib identify {' '.join(CAPTURES)} {options} | head -n 1"
     subprocess.run(command, shell=True, cwd=here, check=True, capture_output=True, timeout=120)
     assert (here / "piped.yaml").exists()
+
+
+def test_a_capture_that_grows_while_it_is_read_gives_nothing(here: Path) -> None:
+    growing = here / "growing.raw"
+    growing.write_bytes((here / "z.raw").read_bytes())
+
+    def grow(amount: int) -> None:
+        if amount > len(b"more"):
+            with growing.open("ab") as capture:
+                capture.write(b"more")
+
+    unit = read_calibration_file(here / "unit.yaml")
+    basis = Basis(unit.model, "unit.yaml", unit.sha256)
+    site = config.read(here / "site.yaml", Site)
+    with pytest.raises(InputError, match=r"growing.raw: .* it was changed while it was read"):
+        find([growing], load_profile("imu50-rs422"), basis, site, advance=grow)
+
+
+# Long, so that reading it takes a while.
+PSINS = (
+    "% clbt\n" * 50_000 + "clbt.rx = [0; 0; 0];\nclbt.ry = [-0.047; 0.04; 0.002];\nclbt.rz = [0; 0; 0.05];\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("command", "texts"),
+    [
+        (
+            ["gauge", "replaced", "--to", "x"],
+            [UNIT, UNIT.replace("24.0, -11", "23.0, -11").replace("-1.0", "0.0")],
+        ),
+        (
+            ["import-arms", "replaced", "--from", "psins", "--calibration", "unit.yaml"],
+            [PSINS, PSINS.replace("0.05", "0.06")],
+        ),
+    ],
+)
+def test_a_certificate_names_the_file_that_its_arms_are_from(
+    command: list[str],
+    texts: list[str],
+    here: Path,
+    replaced_at_random: Callable[..., AbstractContextManager[None]],
+) -> None:
+    def made() -> tuple[str, object]:
+        (here / "made.yaml").unlink(missing_ok=True)
+        assert main([*command, "-o", "made.yaml"]) == 0
+        new = yaml.safe_load((here / "made.yaml").read_text())
+        (how,) = new["provenance"].values()
+        return how["file_sha256"], new["size_effect"]
+
+    expected = {}
+    for text in texts:
+        (here / "replaced").write_text(text)
+        digest, expected[digest] = made()
+        assert digest == sha256(text.encode()).hexdigest()
+    with replaced_at_random(here / "replaced", [text.encode() for text in texts], seed=4):
+        for _ in range(30):
+            digest, size_effect = made()
+            assert size_effect == expected[digest]
 
 
 def test_the_plain_method_and_a_gauge_by_name(here: Path, capsys: pytest.CaptureFixture[str]) -> None:

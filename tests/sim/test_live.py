@@ -6,11 +6,12 @@ import signal
 import socket
 import subprocess
 import sys
+import termios
 import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from queue import Queue
 from typing import Any
@@ -19,7 +20,7 @@ import can
 import numpy as np
 import pytest
 
-from imudrv import profiles
+from imudrv import config, profiles
 from imudrv.errors import InputError
 from imudrv.records import Records
 from imudrv.sim import links
@@ -364,6 +365,61 @@ def test_a_stop_ends_the_wait_for_a_reader(run: Scenario, player: Player) -> Non
     player.start(run, RS422, "pty", 1.0)
     player.stop.set()
     assert player.result().samples == 0
+
+
+@contextmanager
+def full_disk() -> Iterator[int]:
+    """Standard output on a full disk."""
+    with open("/dev/full", "w") as full:
+        yield full.fileno()
+
+
+@contextmanager
+def stopped_terminal() -> Iterator[int]:
+    """Standard output on a terminal after Ctrl-S."""
+    master, slave = os.openpty()
+    termios.tcflow(slave, termios.TCOOFF)
+    yield slave
+    os.close(slave)
+    os.close(master)
+
+
+@pytest.mark.parametrize(
+    ("output", "code", "message"),
+    [(full_disk, 2, "stdout: cannot be written: No space left on device"), (stopped_terminal, 0, "")],
+)
+def test_a_command_whose_text_nobody_takes_sends_all_the_same(
+    output: Callable[[], AbstractContextManager[int]], code: int, message: str, run: Scenario, tmp_path: Path
+) -> None:
+    config.write(tmp_path / "run.yaml", run)
+    command = [sys.executable, "-m", "imudrv", "sim", "run.yaml", "--profile", "imu50-rs422", "--port", "pty"]
+    with output() as stdout:
+        process = subprocess.Popen(
+            [*command, "--link", "imu"], cwd=tmp_path, stdout=stdout, stderr=subprocess.PIPE, text=True
+        )
+        try:
+            with opened(tmp_path / "imu") as fd:
+                assert read_to_the_end(fd) == whole(run, RS422)
+            _, said = process.communicate(timeout=60)
+        finally:
+            process.kill()
+            process.communicate()
+    assert process.returncode == code
+    assert message in said
+
+
+def test_a_command_without_a_standard_output_sends_all_the_same(run: Scenario, tmp_path: Path) -> None:
+    config.write(tmp_path / "run.yaml", run)
+    command = f"{sys.executable} -m imudrv sim run.yaml --profile imu50-rs422 --port pty --link imu >&-"
+    process = subprocess.Popen(command, shell=True, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+    try:
+        with opened(tmp_path / "imu") as fd:
+            assert read_to_the_end(fd) == whole(run, RS422)
+        _, said = process.communicate(timeout=60)
+    finally:
+        process.kill()
+        process.communicate()
+    assert (process.returncode, said) == (0, "")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -1,0 +1,78 @@
+"""Printing in the background: nothing that happens to the output reaches the caller."""
+
+import os
+import re
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from imudrv.printer import LIMIT, Printer
+
+DEADLINE_S = 60.0
+LINE_BYTES = 1000
+"""So long that the 64 KiB of a pipe hold a small part of the queue."""
+
+
+def until(true: Callable[[], object], what: str) -> None:
+    """Wait for something that must come; the deadline only ends a broken test."""
+    end = time.monotonic() + DEADLINE_S
+    while not true():
+        assert time.monotonic() < end, f"waited in vain: {what}"
+        time.sleep(0.01)
+
+
+def test_lines_come_out_in_order_and_whole(tmp_path: Path) -> None:
+    with (tmp_path / "text").open("w", encoding="ascii") as text:
+        with Printer(text) as printer:
+            for n in range(LIMIT):
+                printer.say(f"{n} µ")  # as far as the output knows the character
+        assert printer.lost == 0
+        assert not printer.notices()
+    assert (tmp_path / "text").read_text().splitlines() == [f"{n} \\xb5" for n in range(LIMIT)]
+
+
+def test_an_output_that_takes_nothing_costs_the_oldest_lines_and_says_how_many() -> None:
+    reader, writer = os.pipe()
+    said = [f"{n:{LINE_BYTES}d}" for n in range(3 * LIMIT)]
+    with open(writer, "w") as text:
+        printer = Printer(text)
+        for line in said:
+            printer.say(line)
+        until(printer.notices, "a notice")
+        assert re.search(rf"takes no text.*waiting lines: {LIMIT + 1}, lost: ", *printer.notices())
+        assert printer.lost >= len(said) - LIMIT - (1 << 16) // LINE_BYTES - 1
+        got = bytearray()
+        while not got.endswith(f"{said[-1]}\n".encode()):
+            got += os.read(reader, 1 << 16)
+        until(lambda: not printer.notices(), "the end of the notice")
+        printer.close()
+    os.close(reader)
+    lines = got.decode().splitlines()
+    notes = [int(lost) for line in lines for lost in re.findall(r"^\(lost lines: (\d+)\)$", line)]
+    printed = [line for line in lines if not line.startswith("(")]
+    assert sum(notes) == printer.lost == len(said) - len(printed)
+    assert printed == sorted(printed)
+    assert printed[-LIMIT:] == said[-LIMIT:]
+
+
+def test_an_output_that_fails_is_tried_again_with_each_line(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    reader = os.open(tmp_path / "fifo", os.O_RDONLY | os.O_NONBLOCK)
+    with (tmp_path / "fifo").open("w") as text, Printer(text) as printer:
+        os.close(reader)
+        printer.say("nobody")
+        printer.say("reads this")
+        until(lambda: printer.lost == 2, "both lines lost")
+        assert printer.failure.endswith("fifo: cannot be written: Broken pipe; lost lines: 2")
+        assert printer.notices() == [printer.failure]
+        reader = os.open(tmp_path / "fifo", os.O_RDONLY | os.O_NONBLOCK)
+        printer.say("but this")
+        until(lambda: not printer.notices(), "the line written")
+        assert os.read(reader, 1000) == b"(lost lines: 2)\nbut this\n"
+        os.close(reader)
+
+
+def test_without_an_output_nothing_is_missed() -> None:
+    with Printer(None) as printer:
+        printer.say("to nobody")
+    assert printer.lost == 0
