@@ -35,9 +35,9 @@ def read(data: Bytes, p: int, bits: int, signed: bool, big_endian: bool) -> int:
 
 
 @kernel
-def ahead_of(counter: int, other: int, bits: int) -> int:
+def ahead_of(counter: int | np.int64, other: int | np.int64, bits: int) -> int:
     """By how much the low `bits` of `counter` are ahead of those of `other`, as a signed number of `bits`."""
-    return (counter - other) << (64 - bits) >> (64 - bits)
+    return int((counter - other) << (64 - bits) >> (64 - bits))
 
 
 @kernel
