@@ -2,6 +2,6 @@
 
 import sys
 
-from calib.cli import main
+from calib.cli.main import main
 
 sys.exit(main())

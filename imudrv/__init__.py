@@ -25,19 +25,19 @@ Increments come first: `dtheta_b` (rad) and `dv_b` (m/s) cover `interval_ns`, ne
 """
 
 from imudrv.calibration import Calibration, coefficients, read_calibration, write_calibration
-from imudrv.captures import Capture
+from imudrv.capture import Capture
 from imudrv.errors import Imu50Error, InputError
 from imudrv.imu.coefficients import Coefficients
 from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import rate_filter
 from imudrv.imu.sequence import SampleCounts, SequenceTracker
-from imudrv.profiles import Profile
 from imudrv.profiles import load as load_profile
+from imudrv.profiles.schema import Profile
 from imudrv.receive import Receiver, receive
-from imudrv.recording import Recording
-from imudrv.records import FRAME, INCREMENTS, PULSES, Flag, Reason
+from imudrv.recording.reader import Recording
+from imudrv.records import FRAME, INCREMENTS, PULSES, Flag, Reason, Source
 from imudrv.site import Site
-from imudrv.wire.datagram import DatagramDecoder, Source
+from imudrv.wire.datagram import DatagramDecoder
 from imudrv.wire.decoder import CaptureDecoder
 from imudrv.wire.stream import StreamDecoder
 

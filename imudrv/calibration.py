@@ -12,8 +12,9 @@ from pydantic import AfterValidator, JsonValue, model_validator
 from pydantic import Field as Key
 
 from imudrv.arrays import Array
-from imudrv.config import Matrix3, Model, SettingsFile, UtcTime, read_file, write
 from imudrv.errors import InputError
+from imudrv.files.model import Matrix3, Model, UtcTime
+from imudrv.files.settings_file import SettingsFile, read_file, write
 from imudrv.imu.coefficients import Coefficients, TemperatureTerms
 from imudrv.units import ARCSEC, DEG_PER_H, MM, PPM, UG
 

@@ -10,32 +10,36 @@ from typing import TextIO
 
 from rich.console import Console
 
-from imudrv import config, profiles, settings
+from imudrv import profiles
 from imudrv.calibration import Calibration, coefficients, read_calibration_file, require_unit
-from imudrv.captures import Capture
-from imudrv.config import Model
-from imudrv.console import BAD_INPUT, INTERRUPTED, OK, CommandLine, progress
+from imudrv.capture import Capture
 from imudrv.demo import demo
-from imudrv.doctor import doctor
+from imudrv.doctor.examine import doctor
 from imudrv.errors import InputError
-from imudrv.export import KINDS, export
+from imudrv.files import settings_file
+from imudrv.files.model import Model
+from imudrv.files.outputs import is_standard_output, require_other
+from imudrv.files.tables import increment_columns, pulse_columns, table, writing
 from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import NAMES, rate_filter
-from imudrv.monitor import monitor
-from imudrv.outputs import is_standard_output, require_other
-from imudrv.printer import Printer
-from imudrv.process import Signals
-from imudrv.profiles import Profile
-from imudrv.recording import Recording, pack
-from imudrv.service import Service
-from imudrv.settings import Settings
+from imudrv.profiles.schema import Profile
+from imudrv.recording.export import KINDS, export
+from imudrv.recording.pack import pack
+from imudrv.recording.reader import Recording
+from imudrv.service import settings
+from imudrv.service.loop import Service
+from imudrv.service.monitor import monitor
+from imudrv.service.printer import Printer
+from imudrv.service.runtime import Signals
+from imudrv.service.settings import Settings
+from imudrv.service.status import EXIT_CODES
+from imudrv.service.status_socket import ask
 from imudrv.sim import scenario as scenarios
 from imudrv.sim.capture import record
 from imudrv.sim.live import play, speed_of
 from imudrv.sim.scenario import Scenario
-from imudrv.sinks.files import increment_columns, pulse_columns, table, writing
 from imudrv.site import Site
-from imudrv.status import EXIT_CODES, ask
+from imudrv.terminal import BAD_INPUT, INTERRUPTED, OK, CommandLine, progress
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -49,7 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit code, see `imudrv.console`.
+        Exit code, see `imudrv.terminal`.
     """
     return _commands().run(argv)
 
@@ -323,10 +327,10 @@ def _check(arguments: argparse.Namespace) -> None:
         "imu50-scenario": Scenario,
         "imu50-service": Settings,
     }
-    kind = config.kind(arguments.file)
+    kind = settings_file.kind(arguments.file)
     if kind not in kinds:
         raise InputError(f"{arguments.file}: format: expected one of {', '.join(kinds)}, got {kind!r}")
-    config.read(arguments.file, kinds[kind])
+    settings_file.read(arguments.file, kinds[kind])
     print(f"{arguments.file}: a good {kind} file")
 
 

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from imudrv.imu.sequence import SampleCounts, SequenceTracker
-from imudrv.profiles import Profile, SerialLine
+from imudrv.profiles.schema import Profile, SerialLine
 from imudrv.records import Reason, Records
 from imudrv.units import NS, NS_PER_S
 from imudrv.wire.decoder import FrameDecoder

@@ -15,8 +15,8 @@ from numba.core import config
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-CONSTANTS: Final = ("records.py", "units.py", "wire/layout.py")
-"""Files without kernels whose constants kernels read."""
+CONSTANTS: Final = ("arrays.py", "records.py", "units.py", "wire/layout.py", "wire/tables.py")
+"""Files without kernels whose constants and types kernels read."""
 
 
 def _cache_folder() -> str:

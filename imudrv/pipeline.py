@@ -9,7 +9,7 @@ from imudrv.imu.coefficients import Coefficients
 from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import RateFilter
 from imudrv.imu.sequence import SequenceTracker
-from imudrv.profiles import Profile
+from imudrv.profiles.schema import Profile
 from imudrv.records import INCREMENTS, PULSES, Flag, Records
 from imudrv.wire.decoder import FrameDecoder
 

@@ -6,18 +6,21 @@ A name without a frame in it is on the sensors' own axes; ``dtheta_b`` and ``dv_
 """
 
 from enum import IntEnum, IntFlag
-from typing import Final, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 Records: TypeAlias = NDArray[np.void]
 
+
 MAX_TEMPERATURES: Final = 6
 """Temperature channels that a profile may have."""
 
+
 NO_TEMPERATURE: Final = -(2**31)
 """Temperature counts of a channel from which nothing has been received yet."""
+
 
 MESSAGE: Final = np.dtype(
     [
@@ -30,6 +33,7 @@ MESSAGE: Final = np.dtype(
     align=True,
 )
 """One CAN message."""
+
 
 FRAME: Final = np.dtype(
     [
@@ -46,6 +50,7 @@ FRAME: Final = np.dtype(
     align=True,
 )
 """One good frame as received."""
+
 
 PULSES: Final = np.dtype(
     [
@@ -66,6 +71,7 @@ PULSES: Final = np.dtype(
 )
 """One sample of pulse increments, accounted for."""
 
+
 INCREMENTS: Final = np.dtype(
     [
         ("counter", np.int64),
@@ -78,6 +84,7 @@ INCREMENTS: Final = np.dtype(
     align=True,
 )
 """One sample of compensated increments, body axes."""
+
 
 REJECT: Final = np.dtype([("offset", np.int64), ("length", np.int64), ("reason", np.int64)])
 """A run of input that is not a frame."""
@@ -107,3 +114,26 @@ class Flag(IntFlag):
     SIZE_EFFECT = 1 << 6
     CLOCK_UNLOCKED = 1 << 7
     WARM_UP = 1 << 8
+
+
+class Source(IntEnum):
+    """Origin of the samples."""
+
+    HARDWARE = 0
+    REPLAY = 1
+    SIMULATOR = 2
+
+
+class Arrival(NamedTuple):
+    """What one read brought.
+
+    Parameters
+    ----------
+    t_ns : int
+        When, host clock (`imudrv.hostclock`); of a replay the recorded time.
+    data : bytes or ndarray of MESSAGE
+        Wire bytes, or CAN messages each with its own `t_ns`; empty when the wait ended without any.
+    """
+
+    t_ns: int
+    data: bytes | Records

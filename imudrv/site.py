@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field as Key
 
-from imudrv.config import Model
+from imudrv.files.model import Model
 from imudrv.nav.earth import normal_gravity
 from imudrv.units import DEG
 

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from imudrv.calibration import Calibration, coefficients, read_calibration, write_calibration
-from imudrv.config import kind, parse, read, write
 from imudrv.errors import FaultyFileError, InputError
+from imudrv.files.settings_file import kind, parse, read, write
 from imudrv.nav.earth import normal_gravity
 from imudrv.site import Site
 

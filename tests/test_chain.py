@@ -7,7 +7,7 @@ import pytest
 
 from imudrv import profiles
 from imudrv.calibration import Calibration, coefficients
-from imudrv.config import parse
+from imudrv.files.settings_file import parse
 from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import rate_filter
 from imudrv.imu.sequence import SequenceTracker

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.cli import main as calib
+from calib.cli.main import main as calib
 from imudrv.calibration import write_calibration
 from imudrv.cli import main as imudrv
 from imudrv.sim.scenario import NOMINAL
@@ -71,7 +71,7 @@ def test_a_log_of_two_units_is_refused_by_every_command_however_late_the_second_
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("imudrv.captures.CHUNK_BYTES", 4096)  # the log is read in 70 pieces
+    monkeypatch.setattr("imudrv.capture.CHUNK_BYTES", 4096)  # the log is read in 70 pieces
     main, before, behind = COMMANDS[command]
     assert main([*before, log, *behind]) == 2
     assert capsys.readouterr().err == f"error: {BOTH.replace('two.log', log)}--channel can0\n"

@@ -16,21 +16,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import Field, JsonValue
 
-from imudrv import config
-from imudrv.config import (
-    Matrix3,
-    Model,
-    UtcTime,
-    Vector3,
-    kind,
-    parse,
-    read,
-    read_file,
-    sha256,
-    unchanged,
-    write,
-)
 from imudrv.errors import FaultyFileError, InputError
+from imudrv.files import atomic, yaml_text
+from imudrv.files.atomic import sha256, unchanged
+from imudrv.files.faults import MAX_FAULTS
+from imudrv.files.model import Matrix3, Model, UtcTime, Vector3
+from imudrv.files.settings_file import kind, parse, read, read_file, write
 
 
 class Line(Model):
@@ -284,8 +275,8 @@ def test_a_file_that_is_no_mapping_is_told(file: Path, text: str, came: str) -> 
 
 def test_many_faults_are_counted_not_all_printed() -> None:
     faults = faults_of({**HEADER, "lines": [{}] * 1000})
-    assert len(faults) == config.MAX_FAULTS + 1
-    assert faults[-1] == f"and {1000 - config.MAX_FAULTS} more"
+    assert len(faults) == MAX_FAULTS + 1
+    assert faults[-1] == f"and {1000 - MAX_FAULTS} more"
 
 
 @pytest.mark.parametrize("value", ["\x1b[31m" * 30, {"\x1b[31m" * 30: 1}, {"k" * 1000: 1}])
@@ -326,20 +317,20 @@ def test_a_billion_laughs_do_not_grow(file: Path) -> None:
 @pytest.mark.parametrize("opening", ["[", "[[1], ", "- ", "{a: "])
 def test_deep_nesting_is_refused_not_recursed(file: Path, opening: str) -> None:
     # 500 levels: below the bound that some builds of libyaml have of their own.
-    assert f"expected at most {config.MAX_DEPTH} levels of nesting" in faults_in(file, opening * 500)
+    assert f"expected at most {yaml_text.MAX_DEPTH} levels of nesting" in faults_in(file, opening * 500)
     assert "nesting" in faults_in(file, opening * 10_000)
 
 
 def test_the_deepest_nesting_that_is_said_to_be_allowed_is(file: Path) -> None:
-    levels = config.MAX_DEPTH - 2  # two mappings stand around the lists
+    levels = yaml_text.MAX_DEPTH - 2  # two mappings stand around the lists
     file.write_text(f"content: {{a: {'[' * levels}{']' * levels}}}")
     assert read(file, Free)
     assert "levels" in faults_in(file, f"content: {{a: {'[' * (levels + 1)}{']' * (levels + 1)}}}")
 
 
 def test_too_many_values_are_refused(file: Path) -> None:
-    assert f"expected at most {config.MAX_EVENTS} values" in faults_in(
-        file, f"a: [{'1,' * config.MAX_EVENTS}]"
+    assert f"expected at most {yaml_text.MAX_EVENTS} values" in faults_in(
+        file, f"a: [{'1,' * yaml_text.MAX_EVENTS}]"
     )
 
 
@@ -362,9 +353,9 @@ def test_control_characters_are_refused(file: Path) -> None:
 
 
 def test_a_large_file_is_not_read(file: Path) -> None:
-    file.write_bytes(b"#" * config.MAX_BYTES)
+    file.write_bytes(b"#" * atomic.MAX_BYTES)
     assert kind_fault(file) == "expected a mapping (key: value), got nothing"
-    file.write_bytes(b"#" * (config.MAX_BYTES + 1))
+    file.write_bytes(b"#" * (atomic.MAX_BYTES + 1))
     with pytest.raises(InputError, match="expected a settings file of at most 1048576 bytes"):
         read(file, Settings)
 
@@ -643,11 +634,11 @@ def test_a_folder_is_not_overwritten(tmp_path: Path) -> None:
 
 def test_nothing_is_written_that_could_not_be_read(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     deep: object = 1
-    for _ in range(config.MAX_DEPTH):
+    for _ in range(yaml_text.MAX_DEPTH):
         deep = [deep]
     with pytest.raises(InputError, match="levels of nesting"):
         write(file, {"content": deep})
-    monkeypatch.setattr(config, "MAX_BYTES", 100)
+    monkeypatch.setattr("imudrv.files.settings_file.MAX_BYTES", 100)
     with pytest.raises(InputError, match="expected at most 100 bytes to write, got 110"):
         write(file, {"content": "x" * 100})
     assert names(file.parent) == []

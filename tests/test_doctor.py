@@ -15,17 +15,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from imudrv import diagnosis, doctor, profiles
-from imudrv.config import parse
-from imudrv.doctor import Step, System, Verdict, examine
+from imudrv import diagnosis, profiles
+from imudrv.doctor import device
+from imudrv.doctor import examine as examination
+from imudrv.doctor.device import System
+from imudrv.doctor.examine import examine
+from imudrv.doctor.verdict import Step, Verdict
 from imudrv.errors import InputError
+from imudrv.files.settings_file import parse
 from imudrv.ports import Arrival, Port, PortLostError
 from imudrv.ports.url import split
-from imudrv.records import MESSAGE, Reason
+from imudrv.records import MESSAGE, Reason, Source
 from imudrv.sim.capture import wire
 from imudrv.sim.live import play
 from imudrv.sim.scenario import Scenario
-from imudrv.wire.datagram import Source
 
 RS422, ACC, CAN, CANFD = (
     profiles.load(name) for name in ("imu50-rs422", "imu50-rs422-acc", "imu50-can", "imu50-canfd")
@@ -90,13 +93,13 @@ def test_a_unit_of_the_right_profile_is_healthy(profile: profiles.Profile, playi
 
 
 def test_the_command_tells_each_step_and_the_sum(playing: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "LISTEN_S", LISTEN_S)
+    monkeypatch.setattr(examination, "LISTEN_S", LISTEN_S)
     said: list[str] = []
-    assert doctor.doctor(playing(RS422), "imu50-rs422", said.append)
+    assert examination.doctor(playing(RS422), "imu50-rs422", said.append)
     assert said[0].startswith("  ok  device: /dev/pts/")
     assert said[-1] == "healthy"
     said.clear()
-    assert not doctor.doctor("/dev/no-such-port", "imu50-rs422", said.append)
+    assert not examination.doctor("/dev/no-such-port", "imu50-rs422", said.append)
     assert said[0].startswith("fail  device: there is no /dev/no-such-port\n        -> ")
     assert "must be mended" in said[-1]
 
@@ -194,10 +197,10 @@ def test_a_wrong_rate_is_found_by_trying(
             raise InputError("no such rate")
         return FakeLine(url, baudrate, rate, unit)
 
-    monkeypatch.setattr(doctor, "open_port", open_fake)
-    monkeypatch.setattr(doctor, "BAUDRATES", (115_201, *doctor.BAUDRATES))
-    monkeypatch.setattr(doctor, "_listen", lambda port, _: (port.read(0.0).data, 0.2, ""))
-    monkeypatch.setattr(doctor, "_before", lambda *_: iter(()))
+    monkeypatch.setattr(examination, "open_port", open_fake)
+    monkeypatch.setattr(examination, "BAUDRATES", (115_201, *examination.BAUDRATES))
+    monkeypatch.setattr(examination, "_listen", lambda port, _: (port.read(0.0).data, 0.2, ""))
+    monkeypatch.setattr(examination, "_before", lambda *_: iter(()))
     data = by_name(examine("/dev/ttyUSB9", "imu50-rs422", 0.1))["data"]
     assert data.found.endswith(found)
     assert data.fix == fix
@@ -233,7 +236,7 @@ def adapter(system: System, latency_ms: int, control: str) -> None:
 
 def test_a_slow_latency_timer_and_a_sleepy_adapter_are_told_with_their_fix(system: System) -> None:
     adapter(system, 16, "auto")
-    steps = by_name(doctor.usb("ttyUSB0", system))
+    steps = by_name(device.usb("ttyUSB0", system))
     timer, sleep = steps["latency timer"], steps["USB autosuspend"]
     assert timer.verdict is sleep.verdict is Verdict.WARN
     assert "16 ms" in timer.found
@@ -246,14 +249,14 @@ def test_a_slow_latency_timer_and_a_sleepy_adapter_are_told_with_their_fix(syste
 
 def test_a_quick_adapter_is_well_and_a_port_that_is_none_says_nothing(system: System) -> None:
     adapter(system, 1, "on")
-    assert {step.verdict for step in doctor.usb("ttyUSB0", system)} == {Verdict.OK}
-    assert list(doctor.usb("pts0", system)) == []
+    assert {step.verdict for step in device.usb("ttyUSB0", system)} == {Verdict.OK}
+    assert list(device.usb("pts0", system)) == []
 
 
 @pytest.mark.parametrize(("flags", "verdict"), [("0x10002040", Verdict.OK), ("0x10000040", Verdict.WARN)])
 def test_a_built_in_port_tells_its_low_latency_flag(system: System, flags: str, verdict: Verdict) -> None:
     put(system.sys / "class/tty/ttyS0/flags", flags)
-    (step,) = doctor.usb("ttyS0", system)
+    (step,) = device.usb("ttyS0", system)
     assert step.verdict is verdict
 
 
@@ -369,18 +372,18 @@ def test_a_wrong_check_is_told_apart_from_a_wrong_frame() -> None:
     frames[43::44] = bytes(b ^ 1 for b in frames[43::44])
     heard = diagnosis.hear(RS422, bytes(frames))
     assert Reason.CHECK_FAILED in heard.rejected
-    step = doctor.mismatch(RS422, heard, None, True)
+    step = examination.mismatch(RS422, heard, None, True)
     assert "sync EB 90 seen 100 times, CRC never right" in step.found
 
 
 def test_a_unit_that_reports_a_fault_or_another_rate_is_told() -> None:
     heard = replace(diagnosis.hear(RS422, sent(RS422, 0.2)), set_bits=("power", "warm-up"))
-    steps = by_name(doctor.judge(RS422, heard, 0.5, True))
+    steps = by_name(examination.judge(RS422, heard, 0.5, True))
     assert steps["status"].verdict is Verdict.WARN
     assert steps["status"].found == "power, warm-up"
     assert steps["rate"].verdict is Verdict.FAIL
     assert "expected 1000 samples/s, the unit counts 400" in steps["rate"].found
-    assert "rate" not in by_name(doctor.judge(RS422, heard, 0.5, False))
+    assert "rate" not in by_name(examination.judge(RS422, heard, 0.5, False))
 
 
 def test_the_line_load_is_that_of_the_interface_document() -> None:
@@ -389,7 +392,7 @@ def test_the_line_load_is_that_of_the_interface_document() -> None:
     # two messages of 135 bits at worst and two a tenth of a second: ISO 11898-1
     assert diagnosis.line_load(CAN) == pytest.approx(2.02 * 135e-3, rel=1e-9)
     assert 0.1 < diagnosis.line_load(CANFD) < 0.3
-    slow = RS422.model_copy(update={"line": profiles.SerialLine(baudrate=115_200)})
+    slow = RS422.model_copy(update={"line": SerialLine(baudrate=115_200)})
     step = by_name(examine("/dev/no-such-port?baudrate=115200", "imu50-rs422", 0.1))["line load"]
     assert diagnosis.line_load(slow) > 1.0
     assert step.verdict is Verdict.FAIL
@@ -399,13 +402,13 @@ def test_the_line_load_is_that_of_the_interface_document() -> None:
 def test_limits_that_are_too_low_are_told_with_their_fix(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     monkeypatch.setattr(resource, "getrlimit", lambda limit: (0, 0))
-    steps = by_name(doctor.limits())
+    steps = by_name(device.limits())
     assert {step.verdict for step in steps.values()} == {Verdict.WARN}
     assert "rtprio 50' into /etc/security/limits.d" in steps["real-time priority"].fix
     assert "LimitMEMLOCK=infinity" in steps["locked memory"].fix
     unlimited = (resource.RLIM_INFINITY, resource.RLIM_INFINITY)
     monkeypatch.setattr(resource, "getrlimit", lambda limit: unlimited)
-    assert {step.verdict for step in doctor.limits()} == {Verdict.OK}
+    assert {step.verdict for step in device.limits()} == {Verdict.OK}
 
 
 def test_a_url_or_profile_without_sense_is_refused() -> None:

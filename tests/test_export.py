@@ -7,14 +7,13 @@ import pytest
 
 from imudrv import profiles
 from imudrv.errors import InputError
-from imudrv.export import KINDS, export
-from imudrv.ports.base import Arrival
-from imudrv.recording import Recording
-from imudrv.records import INCREMENTS, MESSAGE, PULSES, Records
+from imudrv.recording.export import KINDS, export
+from imudrv.recording.reader import Recording
+from imudrv.records import INCREMENTS, MESSAGE, PULSES, Arrival, Records, Source
 from imudrv.sinks.base import Batch
 from imudrv.sinks.recorder import Recorder
 from imudrv.wire.candump import CandumpDecoder
-from imudrv.wire.datagram import Source, encode
+from imudrv.wire.datagram import encode
 
 PROFILES = Path(profiles.__file__).parent
 SAMPLES = 3000

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from imudrv.config import parse
 from imudrv.errors import FaultyFileError
+from imudrv.files.settings_file import parse
 from imudrv.sim.scenario import Scenario
 from imudrv.wire.candump import format_candump
 from imudrv.wire.stream import Decoded, StreamDecoder

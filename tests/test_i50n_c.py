@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from imudrv.records import INCREMENTS, Flag, Records
-from imudrv.wire.datagram import SIZE, Source, encode
+from imudrv.records import INCREMENTS, Flag, Records, Source
+from imudrv.wire.datagram import SIZE, encode
 
 TOOLS = Path(__file__).parents[1] / "tools"
 STRICT = ("-Wall", "-Wextra", "-Werror", "-std=c99", "-pedantic")

@@ -11,16 +11,16 @@ from pathlib import Path
 
 import pytest
 
-from calib.cli import main as calib
+from calib.cli.main import main as calib
 from imudrv.calibration import read_calibration, write_calibration
 from imudrv.cli import main as imudrv
 from imudrv.errors import InputError
-from imudrv.export import export
-from imudrv.outputs import file_to_write
-from imudrv.recording import Recording
+from imudrv.files.atomic import replacing
+from imudrv.files.outputs import file_to_write
+from imudrv.files.spool import Piece, Spool
+from imudrv.recording.export import export
+from imudrv.recording.reader import Recording
 from imudrv.sim.scenario import NOMINAL
-from imudrv.sinks.files import replacing
-from imudrv.sinks.spool import Piece, Spool
 
 SCENARIO = """
 format: imu50-scenario

@@ -13,8 +13,8 @@ import pytest
 from imudrv.errors import InputError
 from imudrv.ports.base import PortLostError
 from imudrv.receive import Receiver, receive
-from imudrv.records import INCREMENTS, Records
-from imudrv.wire.datagram import SIZE, Source, encode
+from imudrv.records import INCREMENTS, Records, Source
+from imudrv.wire.datagram import SIZE, encode
 
 WAIT_S = 20.0
 """So long a sample may take on a busy machine before a test fails."""

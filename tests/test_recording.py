@@ -12,12 +12,13 @@ from mcap.writer import CompressionType, Writer
 
 from imudrv import profiles
 from imudrv.errors import FaultyFileError, InputError
-from imudrv.ports.base import Arrival
-from imudrv.recording import Recording, pack, pack_messages, unpack_messages
-from imudrv.records import INCREMENTS, MESSAGE, PULSES
+from imudrv.recording.format import pack_messages, unpack_messages
+from imudrv.recording.pack import pack
+from imudrv.recording.reader import Recording
+from imudrv.records import INCREMENTS, MESSAGE, PULSES, Arrival, Source
 from imudrv.sinks.base import Batch
 from imudrv.sinks.recorder import Recorder
-from imudrv.wire.datagram import Source, encode
+from imudrv.wire.datagram import encode
 
 PROFILES = Path(profiles.__file__).parent
 CALIBRATION = b"""\

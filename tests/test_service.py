@@ -24,17 +24,17 @@ import pytest
 from numpy.typing import ArrayLike, NDArray
 
 from imudrv.calibration import write_calibration
-from imudrv.console import INTERRUPTED
 from imudrv.errors import InputError
 from imudrv.hostclock import now_ns
 from imudrv.profiles import load
 from imudrv.receive import receive
-from imudrv.recording import Recording
+from imudrv.recording.reader import Recording
 from imudrv.records import PULSES, Flag
-from imudrv.service import Service as Driver
-from imudrv.settings import Settings
+from imudrv.service.loop import Service as Driver
+from imudrv.service.settings import Settings
+from imudrv.service.status_socket import ask
 from imudrv.sim.scenario import NOMINAL
-from imudrv.status import ask
+from imudrv.terminal import INTERRUPTED
 from imudrv.units import ARCSEC
 from imudrv.wire.encode import StreamEncoder
 
@@ -458,10 +458,11 @@ def test_a_reader_of_its_text_that_leaves_costs_the_text_alone(folder: Path) -> 
         unit.send(100)
         until(lambda: service.good() == 100, "the first samples")
         unit.unplug()
+        until(lambda: service.status()["port"]["state"] == "lost", "the end of the port")
+        unit.plug()  # which is an event on stdout
         until(
             lambda: "stdout: cannot be written: Broken pipe; lost lines: " in service.notices(), "a warning"
         )
-        unit.plug()
         unit.send(100)
         until(lambda: service.good() == 200, "the other samples")
         assert service.stop() == 0

@@ -11,10 +11,10 @@ from imudrv.calibration import coefficients, write_calibration
 from imudrv.errors import InputError
 from imudrv.imu.rate_filter import rate_filter
 from imudrv.pipeline import Pipeline
-from imudrv.recording import Recording
+from imudrv.recording.reader import Recording
 from imudrv.records import Flag, Records
-from imudrv.service import Service
-from imudrv.settings import Settings
+from imudrv.service.loop import Service
+from imudrv.service.settings import Settings
 from imudrv.sim.scenario import NOMINAL
 from imudrv.sinks.base import Batch, Sink, SinkState
 from imudrv.sinks.history import History

@@ -3,8 +3,8 @@ from pathlib import Path
 
 from imudrv.calibration import write_calibration
 from imudrv.hostclock import now_ns
-from imudrv.service import Service
-from imudrv.settings import Settings
+from imudrv.service.loop import Service
+from imudrv.service.settings import Settings
 from imudrv.sim.scenario import NOMINAL
 
 

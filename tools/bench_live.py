@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imudrv.calibration import write_calibration
-from imudrv.process import quiet_memory
 from imudrv.profiles import load
 from imudrv.records import PULSES
+from imudrv.service.runtime import quiet_memory
 from imudrv.sim.scenario import NOMINAL
 from imudrv.wire.datagram import SIZE
 from imudrv.wire.encode import StreamEncoder

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from imudrv.calibration import coefficients
-from imudrv.captures import Capture
-from imudrv.config import parse
+from imudrv.capture import Capture
+from imudrv.files.settings_file import parse
 from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import rate_filter
 from imudrv.nav.attitude import quaternion_of_matrix

@@ -34,21 +34,22 @@ from numpy.random import Generator
 from rich.console import Console
 from rich.table import Table
 
-from imudrv import config, profiles
+from imudrv import profiles
 from imudrv.calibration import Calibration, coefficients
-from imudrv.console import INTERRUPTED, OK, OUR_FAULT
 from imudrv.errors import InputError
+from imudrv.files import model, settings_file
 from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import NAMES, rate_filter
 from imudrv.imu.sequence import SequenceTracker
-from imudrv.profiles import Profile
-from imudrv.records import INCREMENTS, MESSAGE, PULSES, Records
-from imudrv.settings import Settings
+from imudrv.profiles.schema import Profile
+from imudrv.records import INCREMENTS, MESSAGE, PULSES, Records, Source
+from imudrv.service.settings import Settings
 from imudrv.sim import scenario
 from imudrv.site import Site
+from imudrv.terminal import INTERRUPTED, OK, OUR_FAULT
 from imudrv.wire.can import OPEN_SAMPLES, CanAssembler
 from imudrv.wire.candump import LONGEST_LINE, CandumpDecoder, format_candump
-from imudrv.wire.datagram import _LAYOUT, DATAGRAM, SIZE, DatagramDecoder, Source, encode
+from imudrv.wire.datagram import _LAYOUT, DATAGRAM, SIZE, DatagramDecoder, encode
 from imudrv.wire.decoder import CaptureDecoder
 from imudrv.wire.encode import CanEncoder, StreamEncoder
 from imudrv.wire.layout import COUNTER, Layout
@@ -157,7 +158,7 @@ def layout_of(profile: str | dict[str, Any]) -> Layout:
     """Layout of a shipped profile, by name, or of an invented one."""
     if isinstance(profile, str):
         return SHIPPED[profile]
-    return config.parse(profile, Profile, "invented").layout()
+    return settings_file.parse(profile, Profile, "invented").layout()
 
 
 def wire(rng: Generator, layout: Layout, count: int) -> Any:
@@ -454,21 +455,21 @@ def check_yaml(_: Setup, data: bytes, __: Cuts) -> None:
         path = Path(folder) / "settings.yaml"
         path.write_bytes(data)
         with contextlib.suppress(InputError):
-            config.kind(path)
+            settings_file.kind(path)
         for model in MODELS:
             try:
-                settings = config.read(path, model)
+                settings = settings_file.read(path, model)
             except InputError as error:
                 if not getattr(error, "faults", True):
                     raise AssertionError("refused without a fault") from error
                 continue
             copy = path.with_stem(model.__name__)
-            config.write(copy, settings)
-            assert config.read(copy, model) == settings, "what was written is another"
+            settings_file.write(copy, settings)
+            assert settings_file.read(copy, model) == settings, "what was written is another"
             use(settings)
 
 
-def use(settings: config.Model) -> None:
+def use(settings: model.Model) -> None:
     """Begin what a command would do with a good file."""
     rng = np.random.default_rng(0)
     if isinstance(settings, scenario.Scenario):
@@ -487,7 +488,7 @@ def use(settings: config.Model) -> None:
 
 # The whole chain
 
-COEFFICIENTS: Final = coefficients(config.parse(CALIBRATION, Calibration, "a unit"))
+COEFFICIENTS: Final = coefficients(settings_file.parse(CALIBRATION, Calibration, "a unit"))
 FILTERS: Final = {name: rate_filter(name, 1_000_000) for name in NAMES}
 
 

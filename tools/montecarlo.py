@@ -23,11 +23,13 @@ from rich.progress import track
 from rich.table import Table
 from scipy.stats import chi2
 
-from calib.identify import DIFFERENCES, Identification, joint, plain
-from calib.runs import Priors, Run, collect
+from calib.estimation.joint import joint
+from calib.estimation.plain import plain
+from calib.estimation.result import DIFFERENCES, Identification
+from calib.estimation.runs import Priors, Run, collect
 from imudrv import profiles
 from imudrv.calibration import Calibration, coefficients
-from imudrv.config import parse
+from imudrv.files.settings_file import parse
 from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import rate_filter
 from imudrv.records import Flag, Records

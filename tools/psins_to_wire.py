@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from imudrv import profiles
-from imudrv.console import guarded
 from imudrv.errors import InputError
 from imudrv.records import PULSES, Records
+from imudrv.terminal import guarded
 from imudrv.wire.encode import StreamEncoder
 
 PROFILE = Path(__file__).with_name("psins-100hz.yaml")

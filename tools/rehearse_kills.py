@@ -23,12 +23,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from calib.session import verify
+from calib.bench.verify import verify
 from imudrv.calibration import SizeEffect, read_calibration
 from imudrv.units import MM
 
 RUN: Final = (
-    "import sys; from pathlib import Path; from rich.console import Console; from calib.bench import run; "
+    "import sys; from pathlib import Path; from rich.console import Console; "
+    "from calib.bench.run import run; "
     "run(folder=Path(sys.argv[1]), rehearse=True, speed='max', console=Console())"
 )
 PAUSE_S: Final = (3.0, 25.0)

@@ -31,10 +31,11 @@ import numba
 import numpy as np
 import scipy
 
-from calib.findings import Basis, find
-from calib.validate import Setting, navigate
+from calib.identification import Basis, find
+from calib.validation.navigate import navigate
+from calib.validation.trial import Setting
 from imudrv.calibration import Calibration, coefficients
-from imudrv.config import parse
+from imudrv.files.settings_file import parse
 from imudrv.imu.coefficients import Coefficients
 from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import NAMES, rate_filter
@@ -42,7 +43,8 @@ from imudrv.imu.sequence import SequenceTracker
 from imudrv.nav.alignment import Alignment
 from imudrv.nav.mechanisation import Navigator
 from imudrv.pipeline import Pipeline
-from imudrv.profiles import Profile, load, shipped
+from imudrv.profiles import load, shipped
+from imudrv.profiles.schema import Profile
 from imudrv.records import Records
 from imudrv.sim.capture import record, wire
 from imudrv.sim.scenario import NOMINAL, Scenario

@@ -40,15 +40,15 @@ from numpy.typing import NDArray
 
 from imudrv import cli, profiles
 from imudrv.calibration import write_calibration
-from imudrv.captures import Capture
+from imudrv.capture import Capture
 from imudrv.errors import InputError
+from imudrv.files.tables import increment_columns
 from imudrv.imu.sequence import SampleCounts
 from imudrv.receive import receive
-from imudrv.recording import Recording
+from imudrv.recording.reader import Recording
 from imudrv.records import INCREMENTS, PULSES, Flag, Records
+from imudrv.service.status_socket import ask
 from imudrv.sim.scenario import NOMINAL
-from imudrv.sinks.files import increment_columns
-from imudrv.status import ask
 from imudrv.wire.encode import StreamEncoder
 
 SERIAL: Final = "imu50-rs422"

@@ -18,13 +18,7 @@ from numpy.typing import NDArray
 
 from imudrv.imu.coefficients import Coefficients
 from imudrv.imu.rate_filter import RateFilter
-from imudrv.imu.size_effect import (
-    SIZE_EFFECT,
-    SizeEffect,
-    dv_r,
-    size_effect_constants,
-    unpack_size_effect,
-)
+from imudrv.imu.size_effect import SIZE_EFFECT, SizeEffect, dv_r, size_effect_constants, unpack_size_effect
 from imudrv.kernels import kernel
 from imudrv.records import INCREMENTS, Flag, Records
 from imudrv.units import NS

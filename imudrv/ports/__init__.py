@@ -29,9 +29,10 @@ from collections.abc import Callable
 from functools import partial
 
 from imudrv.errors import InputError
-from imudrv.ports.base import Arrival, Port, PortEndedError, PortLostError
+from imudrv.ports.base import Port, PortEndedError, PortLostError
 from imudrv.ports.url import PYSERIAL, SCHEMES, split
-from imudrv.profiles import Profile
+from imudrv.profiles.schema import Profile
+from imudrv.records import Arrival
 
 __all__ = ["Arrival", "Port", "PortEndedError", "PortLostError", "check_url", "open_port"]
 

@@ -1,11 +1,9 @@
 """What every port keeps to: where wire bytes or CAN messages come from, with their time of arrival."""
 
 from abc import ABC, abstractmethod
-from typing import NamedTuple
 
 from imudrv.errors import Imu50Error
-from imudrv.records import Records
-from imudrv.wire.datagram import Source
+from imudrv.records import Arrival, Source
 
 
 class PortLostError(Imu50Error):
@@ -14,21 +12,6 @@ class PortLostError(Imu50Error):
 
 class PortEndedError(Imu50Error):
     """A replay or a simulation has come to its end; nothing is wrong."""
-
-
-class Arrival(NamedTuple):
-    """What one read brought.
-
-    Parameters
-    ----------
-    t_ns : int
-        When, host clock (`imudrv.hostclock`); of a replay the recorded time.
-    data : bytes or ndarray of MESSAGE
-        Wire bytes, or CAN messages each with its own `t_ns`; empty when the wait ended without any.
-    """
-
-    t_ns: int
-    data: bytes | Records
 
 
 class Port(ABC):

@@ -15,15 +15,14 @@ from typing import Any, Final
 import can
 import numpy as np
 
-from imudrv import config
 from imudrv.errors import InputError
+from imudrv.files import settings_file
 from imudrv.hostclock import now_ns
-from imudrv.ports.base import Arrival, Port, PortLostError
+from imudrv.ports.base import Port, PortLostError
 from imudrv.ports.serial import explain
 from imudrv.ports.url import Url, require_transport, value
-from imudrv.profiles import CanLine, Profile
-from imudrv.records import MESSAGE, Records
-from imudrv.wire.datagram import Source
+from imudrv.profiles.schema import CanLine, Profile
+from imudrv.records import MESSAGE, Arrival, Records, Source
 
 # Whatever python-can logs stands in our messages too; without a handler it would go to the terminal.
 logging.getLogger("can").addHandler(logging.NullHandler())
@@ -81,7 +80,7 @@ def prepare(url: Url, profile: Profile) -> Callable[[], Port]:
     if not isinstance(fd, bool):
         raise InputError(f"{url.text}: fd: expected true or false, got {url.options['fd']}")
     asked = {name: options.pop(name) for name in CanLine.model_fields if name in options}
-    line = config.parse({**profile.line.model_dump(), **asked}, CanLine, url.text)
+    line = settings_file.parse({**profile.line.model_dump(), **asked}, CanLine, url.text)
     options |= _rates(url, interface, line, fd)
     filters = [{"can_id": message.id, "can_mask": _ID_MASK} for message in profile.messages]
     return partial(_open, url.text, interface, channel, {**options, "can_filters": filters})

@@ -21,13 +21,12 @@ import numpy as np
 
 from imudrv.errors import InputError
 from imudrv.hostclock import now_ns
-from imudrv.ports.base import Arrival, Port, PortEndedError, PortLostError
+from imudrv.ports.base import Port, PortEndedError, PortLostError
 from imudrv.ports.url import Url
-from imudrv.profiles import Profile
-from imudrv.records import MESSAGE, Records
+from imudrv.profiles.schema import Profile
+from imudrv.records import MESSAGE, Arrival, Records, Source
 from imudrv.units import NS
 from imudrv.wire.candump import CandumpDecoder
-from imudrv.wire.datagram import Source
 from imudrv.wire.layout import Layout
 
 _CHUNK_BYTES: Final = 1 << 16
@@ -201,7 +200,7 @@ def _log(path: Path, layout: Layout, step_ns: int | None, channel: str | None) -
 
 
 def _recording(path: Path, layout: Layout) -> Pieces:
-    from imudrv.recording import Recording
+    from imudrv.recording.reader import Recording
 
     for arrival in Recording(path).arrivals():
         if isinstance(arrival.data, bytes) == layout.can:

@@ -18,13 +18,13 @@ from urllib.parse import urlencode, urlsplit
 import serial
 from serial.tools.list_ports import comports
 
-from imudrv import config
 from imudrv.errors import InputError
+from imudrv.files import settings_file
 from imudrv.hostclock import now_ns
-from imudrv.ports.base import Arrival, Port, PortLostError
+from imudrv.ports.base import Port, PortLostError
 from imudrv.ports.url import Url, require_transport, value
-from imudrv.profiles import Profile, SerialLine
-from imudrv.wire.datagram import Source
+from imudrv.profiles.schema import Profile, SerialLine
+from imudrv.records import Arrival, Source
 
 _AT_ONCE: Final = 1 << 16
 _SLICE_S: Final = 0.02
@@ -78,7 +78,7 @@ def prepare(url: Url, profile: Profile) -> Callable[[], Port]:
         foreign = {name: text for name, text in url.options.items() if name not in own}
         target = f"{url.scheme}://{url.address}" + (f"?{urlencode(foreign)}" if foreign else "")
     asked = {**profile.line.model_dump(), **{name: value(text) for name, text in own.items()}}
-    return partial(_open, url.text, target, config.parse(asked, SerialLine, url.text))
+    return partial(_open, url.text, target, settings_file.parse(asked, SerialLine, url.text))
 
 
 def explain(device: str, error: OSError) -> str:

@@ -7,13 +7,12 @@ import numpy as np
 
 from imudrv.errors import InputError
 from imudrv.hostclock import now_ns
-from imudrv.ports.base import Arrival, Port, PortEndedError, PortLostError
+from imudrv.ports.base import Port, PortEndedError, PortLostError
 from imudrv.ports.url import split
-from imudrv.profiles import Profile
-from imudrv.records import MESSAGE, Records
+from imudrv.profiles.schema import Profile
+from imudrv.records import MESSAGE, Arrival, Records, Source
 from imudrv.sim.live import AHEAD, MOST, Pace, Playback, speed_of
 from imudrv.sim.scenario import Scenario, load
-from imudrv.wire.datagram import Source
 
 _NOTHING: Final = np.zeros(0, MESSAGE)
 

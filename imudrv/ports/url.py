@@ -5,7 +5,7 @@ from typing import Final, NamedTuple
 from urllib.parse import parse_qsl
 
 from imudrv.errors import InputError
-from imudrv.profiles import Profile
+from imudrv.profiles.schema import Profile
 
 PYSERIAL: Final = ("socket", "rfc2217", "spy", "hwgrep", "alt", "loop", "cp2110")
 SCHEMES: Final = tuple(f"{scheme}://" for scheme in ("serial", *PYSERIAL, "can", "replay", "sim"))

@@ -24,7 +24,7 @@ import can
 import serial
 
 from imudrv.errors import InputError
-from imudrv.profiles import CanLine, Profile, SerialLine
+from imudrv.profiles.schema import CanLine, Profile, SerialLine
 from imudrv.records import Records
 
 SETTLE_S: Final = 0.25

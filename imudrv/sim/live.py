@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from imudrv.errors import InputError
-from imudrv.profiles import Profile
+from imudrv.profiles.schema import Profile
 from imudrv.records import Records
 from imudrv.sim.capture import Piece, wire
 from imudrv.sim.links import open_link

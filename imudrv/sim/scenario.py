@@ -13,8 +13,9 @@ from pydantic import Field as Key
 from pydantic import model_validator
 
 from imudrv.calibration import Calibration, read_calibration
-from imudrv.config import Model, parse, read
 from imudrv.errors import InputError
+from imudrv.files.model import Model
+from imudrv.files.settings_file import parse, read
 from imudrv.site import Site
 from imudrv.units import NS
 

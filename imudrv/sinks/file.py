@@ -9,10 +9,10 @@ from typing import Final
 import numpy as np
 
 from imudrv.errors import InputError
+from imudrv.files.spool import Piece, Spool
+from imudrv.files.tables import CsvTable, increment_columns
 from imudrv.records import Records
 from imudrv.sinks.base import Batch, Sink, SinkState
-from imudrv.sinks.files import CsvTable, increment_columns
-from imudrv.sinks.spool import Piece, Spool
 
 LIMIT: Final = 16_384
 """Samples that wait at the most."""

@@ -7,7 +7,7 @@ the history it names the sample to begin with, and the reads that brought that s
 from collections import deque
 from typing import Final, NamedTuple
 
-from imudrv.ports.base import Arrival
+from imudrv.records import Arrival
 from imudrv.sinks.base import Batch
 
 MAX_BYTES: Final = 64 << 20

@@ -1,7 +1,7 @@
 """The recorder: everything that came and went, into an MCAP file that a kill cannot spoil.
 
 The loop only puts things into queues; a thread writes them each 50 ms, wire bytes first. The file is neither
-chunked nor compressed, for a chunk would hold data back; `imudrv.recording.pack` does both later.
+chunked nor compressed, for a chunk would hold data back; `imudrv.recording.pack.pack` does both later.
 """
 
 import json
@@ -19,14 +19,14 @@ from mcap.opcode import Opcode
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import Writer
 
-from imudrv import recording
+from imudrv.files.spool import Piece, Spool
 from imudrv.hostclock import now_ns
-from imudrv.ports.base import Arrival
-from imudrv.recording import pack_messages
+from imudrv.recording import format
+from imudrv.recording.format import pack_messages
+from imudrv.records import Arrival, Source
 from imudrv.sinks.base import Batch, SinkState
 from imudrv.sinks.history import Moment
-from imudrv.sinks.spool import Piece, Spool
-from imudrv.wire.datagram import SIZE, Source
+from imudrv.wire.datagram import SIZE
 from imudrv.wire.layout import Layout
 
 QUEUE_BYTES: Final = 32 << 20
@@ -190,12 +190,12 @@ class Recorder:
         writer.start(library=f"imu50 {version('imu50')}")
         status = writer.register_schema("imu50.Status", SchemaEncoding.JSONSchema, _STATUS_SCHEMA)
         event = writer.register_schema("imu50.Event", SchemaEncoding.JSONSchema, _EVENT_SCHEMA)
-        wire = recording.CAN_MESSAGES if self._can else recording.BYTES
+        wire = format.CAN_MESSAGES if self._can else format.BYTES
         for number, topic, encoding, schema in (
-            (_WIRE, recording.WIRE, wire, 0),
-            (_INCREMENTS, recording.INCREMENTS, recording.DATAGRAMS, 0),
-            (_STATUS, recording.STATUS, MessageEncoding.JSON, status),
-            (_EVENTS, recording.EVENTS, MessageEncoding.JSON, event),
+            (_WIRE, format.WIRE, wire, 0),
+            (_INCREMENTS, format.INCREMENTS, format.DATAGRAMS, 0),
+            (_STATUS, format.STATUS, MessageEncoding.JSON, status),
+            (_EVENTS, format.EVENTS, MessageEncoding.JSON, event),
         ):
             registered = writer.register_channel(topic, encoding, schema)
             assert registered == number
@@ -206,10 +206,10 @@ class Recorder:
             "source": source.name.lower(),
             "calibration_sha256": sha256(calibration).hexdigest() if calibration is not None else "",
         }
-        writer.add_metadata(recording.ORIGIN, origin)
-        self._attach(t_ns, recording.PROFILE, profile)
+        writer.add_metadata(format.ORIGIN, origin)
+        self._attach(t_ns, format.PROFILE, profile)
         if calibration is not None:
-            self._attach(t_ns, recording.CALIBRATION, calibration)
+            self._attach(t_ns, format.CALIBRATION, calibration)
 
     def _attach(self, t_ns: int, name: str, data: bytes) -> None:
         self._writer.add_attachment(t_ns, t_ns, name, "application/yaml", data)
@@ -218,7 +218,7 @@ class Recorder:
         with suppress(IndexError):
             while True:
                 t_ns, calibration = self._calibrations.popleft()
-                self._attach(t_ns, recording.CALIBRATION, calibration)
+                self._attach(t_ns, format.CALIBRATION, calibration)
         arrivals = self._wire.take(_PIECE)
         data = [arrival.data for arrival in arrivals]
         pieces = pack_messages(data) if self._can and data else data  # type: ignore[arg-type]

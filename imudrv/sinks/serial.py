@@ -9,11 +9,11 @@ from typing import Final
 
 import serial
 
-from imudrv import config
 from imudrv.errors import InputError
+from imudrv.files import settings_file
 from imudrv.ports.serial import explain
 from imudrv.ports.url import split, value
-from imudrv.profiles import SerialLine
+from imudrv.profiles.schema import SerialLine
 from imudrv.sinks.backlog import Backlog
 from imudrv.sinks.base import Batch, Sink, SinkState
 from imudrv.wire.datagram import SIZE
@@ -137,4 +137,4 @@ def _parse(url: str) -> tuple[str, SerialLine]:
             f"got {parts.address!r}"
         )
     options = {name: value(text) for name, text in parts.options.items()}
-    return parts.address, config.parse({"baudrate": BAUDRATE, **options}, SerialLine, url)
+    return parts.address, settings_file.parse({"baudrate": BAUDRATE, **options}, SerialLine, url)

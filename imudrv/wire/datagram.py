@@ -1,20 +1,22 @@
 """The output datagram `I50N`, version 1: 76 bytes per sample, one or more in a packet (ICD, section 7)."""
 
-from enum import IntEnum
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from imudrv.kernels import kernel
-from imudrv.records import INCREMENTS, Records
+from imudrv.records import INCREMENTS, Records, Source
 from imudrv.wire.check import compute
 from imudrv.wire.layout import Check, CheckKind, Layout, Message
 from imudrv.wire.stream import StreamDecoder
 from imudrv.wire.tables import layout_tables
 
 MAGIC: Final = b"I50N"
+
+
 VERSION: Final = 1
+
 
 DATAGRAM: Final = np.dtype(
     [
@@ -30,17 +32,15 @@ DATAGRAM: Final = np.dtype(
         ("crc", "<u4"),
     ]
 )
+
+
 SIZE: Final = DATAGRAM.itemsize
+
+
 _CHECKED: Final = SIZE - 4
+
+
 _SAME: Final = ("flags", "counter", "interval_ns", "t_ns", "dtheta_b", "dv_b")
-
-
-class Source(IntEnum):
-    """Origin of the samples."""
-
-    HARDWARE = 0
-    REPLAY = 1
-    SIMULATOR = 2
 
 
 def encode(increments: Records, source: Source) -> bytes:

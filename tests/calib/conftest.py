@@ -11,13 +11,12 @@ from scipy.spatial.transform import Rotation as Attitude
 
 from imudrv import profiles
 from imudrv.nav.earth import earth_rate_n, normal_gravity
-from imudrv.ports.base import Arrival
-from imudrv.records import INCREMENTS, PULSES, Flag, Records
+from imudrv.records import INCREMENTS, PULSES, Arrival, Flag, Records, Source
 from imudrv.sinks.base import Batch
 from imudrv.sinks.recorder import Recorder
 from imudrv.site import Site
 from imudrv.units import DEG, NS
-from imudrv.wire.datagram import Source, encode
+from imudrv.wire.datagram import encode
 from imudrv.wire.encode import StreamEncoder
 
 Array = NDArray[np.float64]

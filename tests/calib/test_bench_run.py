@@ -17,22 +17,23 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from calib import bench
-from calib.bench import SEED
-from calib.findings import Basis
-from calib.journal import Journal, begin
-from calib.procedure import load, predicted
-from calib.rehearsal import BENCH, technician
-from calib.result import Attempt, identify
-from calib.session import JOURNAL, Session, verify
-from imudrv import config
+from calib.bench import run
+from calib.bench.evidence import Attempt, identify
+from calib.bench.journal import Journal, begin
+from calib.bench.session import JOURNAL, Session
+from calib.bench.simulated_unit import SEED
+from calib.bench.technician import BENCH, technician
+from calib.bench.verify import verify
+from calib.identification import Basis
+from calib.procedure.plan import load, predicted
 from imudrv.calibration import SizeEffect, read_calibration, write_calibration
-from imudrv.config import sha256
 from imudrv.errors import InputError
-from imudrv.recording import Recording
+from imudrv.files import atomic, settings_file
+from imudrv.files.atomic import sha256
+from imudrv.recording.reader import Recording
+from imudrv.records import Source
 from imudrv.sim.scenario import NOMINAL
 from imudrv.sinks.recorder import Recorder
-from imudrv.wire.datagram import Source
 
 # The alignment is short: of what follows from it, heading and biases, the joint estimate finds most anew.
 PROCEDURE = """
@@ -53,7 +54,7 @@ import sys
 from pathlib import Path
 from rich.console import Console
 from calib.bench import run
-from imudrv.console import guarded
+from imudrv.terminal import guarded
 procedure, folder, *redo = sys.argv[1:]
 sys.exit(guarded(lambda: run(
     procedure=procedure,
@@ -138,7 +139,7 @@ def test_a_rehearsal_in_fast_time_is_not_said_to_be_at_a_wrong_rate(undisturbed:
 
 def test_the_operator_is_told_that_the_unit_sends_no_frame_of_the_profile(tmp_path: Path) -> None:
     write_calibration(tmp_path / "unit.yaml", NOMINAL)
-    config.write(tmp_path / "site.yaml", BENCH)
+    settings_file.write(tmp_path / "site.yaml", BENCH)
     (tmp_path / "short.yaml").write_text(PROCEDURE)
     files = ["--calibration", "unit.yaml", "--site", "site.yaml", "--procedure", "short.yaml"]
     sends = ["sim", "static", "--profile", "imu50-rs422-acc", "--port", "pty", "--link", "port"]
@@ -312,7 +313,7 @@ def test_only_a_session_that_is_there_can_be_done_again_in_part(tmp_path: Path) 
     with pytest.raises(
         InputError, match="--redo: expected a session that is there, with --session, got none"
     ):
-        bench.run(folder=tmp_path / "new", rehearse=True, redo=["z-up"], console=Console())
+        run.run(folder=tmp_path / "new", rehearse=True, redo=["z-up"], console=Console())
 
 
 def test_a_counter_that_went_round_before_the_recording_makes_no_difference(
@@ -400,22 +401,22 @@ def check_resumed(folder: Path) -> None:
 def test_a_session_that_is_over_is_not_begun_again(undisturbed: tuple[Path, str]) -> None:
     folder, _ = undisturbed
     with pytest.raises(InputError, match=r"the session is over, see report.html in it"):
-        bench.run(folder=folder, rehearse=True, console=Console())
+        run.run(folder=folder, rehearse=True, console=Console())
 
 
 def test_keys_need_a_terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with open(os.devnull) as nothing:
         monkeypatch.setattr(sys, "stdin", nothing)
         with pytest.raises(InputError, match="expected a terminal for the operator's keys"):
-            bench.run(folder=tmp_path / "new", console=Console())
+            run.run(folder=tmp_path / "new", console=Console())
 
 
 def test_a_rehearsal_has_its_own_unit_and_a_unit_no_rehearsal(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--rehearse: expected no --port"):
-        bench.run(folder=tmp_path / "new", rehearse=True, port="/dev/ttyUSB0", console=Console())
+        run.run(folder=tmp_path / "new", rehearse=True, port="/dev/ttyUSB0", console=Console())
     (tmp_path / JOURNAL).touch()
     with pytest.raises(InputError, match="expected a rehearsal to go on with"):
-        bench.run(folder=tmp_path, rehearse=True, console=Console())
+        run.run(folder=tmp_path, rehearse=True, console=Console())
 
 
 def test_a_recording_that_changes_while_it_is_read_gives_nothing(
@@ -429,7 +430,7 @@ def test_a_recording_that_changes_while_it_is_read_gives_nothing(
             recording.write(b"more")
         return sha256(path)
 
-    monkeypatch.setattr(config, "sha256", change_and_hash)
+    monkeypatch.setattr(atomic, "sha256", change_and_hash)
     session = Session.open(copy)
     with closing(session), pytest.raises(InputError, match=r"z-up.*mcap: .* changed while it was read"):
         session.identify()
@@ -455,10 +456,10 @@ def test_the_plan_holds_the_site_and_the_procedure_that_were_judged(
     def create(folder: Path, **about: Any) -> None:
         raise CreatedError(about["procedure"].text, about["site"].text)
 
-    monkeypatch.setattr(bench, "predicted", judge)
+    monkeypatch.setattr(run, "predicted", judge)
     monkeypatch.setattr(Session, "create", create)
     with pytest.raises(CreatedError) as created:
-        bench.run(
+        run.run(
             port="/dev/ttyUSB0",
             profile="imu50-rs422",
             calibration=unit,
@@ -473,4 +474,4 @@ def test_the_plan_holds_the_site_and_the_procedure_that_were_judged(
 
 def test_a_new_session_wants_the_units_papers(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="expected --port, --profile, --calibration and --site"):
-        bench.run(folder=tmp_path / "new", hands_free=True, console=Console())
+        run.run(folder=tmp_path / "new", hands_free=True, console=Console())

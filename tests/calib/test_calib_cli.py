@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 import yaml
 
-from calib.cli import main
-from calib.findings import Basis, find
-from imudrv import config
+from calib.cli.main import main
+from calib.identification import Basis, find
 from imudrv.calibration import read_calibration_file, write_calibration
 from imudrv.cli import main as imudrv
 from imudrv.errors import InputError
+from imudrv.files import settings_file
 from imudrv.profiles import load as load_profile
 from imudrv.sim.scenario import NOMINAL
 from imudrv.site import Site
@@ -173,7 +173,7 @@ def test_a_chosen_channel_of_a_log_of_two_units_is_named_in_certificate_and_repo
 def test_a_certificate_that_the_data_contradict_is_refused_but_the_report_is_there(
     here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("calib.identify.CHI_SQUARE_LIMIT", 1e-3)
+    monkeypatch.setattr("calib.estimation.result.CHI_SQUARE_LIMIT", 1e-3)
     assert identify(*CAPTURES, "-o", "bad.yaml", "--json", "bad.json", "--report", "bad.html") == 2
     told = capsys.readouterr()
     assert re.search(r"^  bad +The velocities contradict the model", told.out, re.MULTILINE)
@@ -201,7 +201,7 @@ def test_a_capture_that_grows_while_it_is_read_gives_nothing(here: Path) -> None
 
     unit = read_calibration_file(here / "unit.yaml")
     basis = Basis(unit.model, "unit.yaml", unit.sha256)
-    site = config.read(here / "site.yaml", Site)
+    site = settings_file.read(here / "site.yaml", Site)
     with pytest.raises(InputError, match=r"growing.raw: .* it was changed while it was read"):
         find([growing], load_profile("imu50-rs422"), basis, site, advance=grow)
 

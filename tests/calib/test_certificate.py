@@ -8,22 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.certificate import (
-    CHANGED,
-    FOUND,
-    arms_of,
-    certificate,
-    check_target,
-    result_document,
-    with_arms,
-    write,
-    write_json,
-)
-from calib.findings import Basis, Findings
-from calib.gauge import convert
-from calib.identify import SHIFT_FREE, Identification, Nuisance, RunResult
-from calib.runs import Priors
-from calib.segments import Limits, Noise
+from calib.certificate import CHANGED, FOUND, arms_of, certificate, check_target, with_arms, write
+from calib.detection.acceptance import Limits
+from calib.detection.noise import Noise
+from calib.estimation.result import SHIFT_FREE, Identification, Nuisance, RunResult
+from calib.estimation.runs import Priors
+from calib.identification import Basis, Findings
+from calib.lever_arms.gauge import convert
+from calib.result_file import result_document, write_json
 from imudrv.calibration import Calibration, read_calibration, write_calibration
 from imudrv.errors import InputError
 from imudrv.sim.scenario import NOMINAL

@@ -13,30 +13,36 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from calib import conduct as conducts
-from calib.conduct import Conduct, Tap
-from calib.console import Keys, Screen, plain
-from calib.events import View
-from calib.procedure import Procedure, steps_left
-from calib.rehearsal import BENCH, Mistake, technician
-from calib.session import Document, Session, verify
-from imudrv import config, profiles
+from calib.bench import controller as conducts
+from calib.bench.controller import Conduct
+from calib.bench.evidence import Result
+from calib.bench.keys import Keys
+from calib.bench.queue_sink import Tap
+from calib.bench.screen import Screen, plain
+from calib.bench.session import Document, Session
+from calib.bench.technician import BENCH, Mistake, technician
+from calib.bench.verify import verify
+from calib.procedure.events import View
+from calib.procedure.plan import steps_left
+from calib.procedure.schema import Procedure
+from imudrv import profiles
 from imudrv.calibration import coefficients, write_calibration
 from imudrv.diagnosis import LineState
 from imudrv.errors import InputError
+from imudrv.files import settings_file
 from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import rate_filter
 from imudrv.imu.sequence import SequenceTracker
-from imudrv.ports.base import Arrival
-from imudrv.recording import Recording
-from imudrv.service import Service
-from imudrv.settings import Settings
+from imudrv.recording.reader import Recording
+from imudrv.records import Arrival, Source
+from imudrv.service.loop import Service
+from imudrv.service.settings import Settings
 from imudrv.sim.scenario import NOMINAL, Rest, Scenario, Segment
 from imudrv.sim.unit import simulate
 from imudrv.sinks.base import Batch
 from imudrv.sinks.history import MAX_BYTES, History
 from imudrv.sinks.recorder import Recorder
-from imudrv.wire.datagram import Source, encode
+from imudrv.wire.datagram import encode
 from imudrv.wire.decoder import FrameDecoder
 from imudrv.wire.encode import StreamEncoder
 
@@ -49,7 +55,7 @@ align_s: 30
 rest_s: 4
 poses: [{id: z-up, up: +Z, east: +X, turn_deg: 180}]
 """
-PROCEDURE = config.parse_text(ONE.encode(), Procedure, "one.yaml")
+PROCEDURE = settings_file.parse_text(ONE.encode(), Procedure, "one.yaml")
 
 
 class Line:
@@ -145,7 +151,7 @@ def batches() -> list[Batch]:
 @pytest.fixture
 def session(tmp_path: Path) -> Iterator[Session]:
     write_calibration(tmp_path / "unit.yaml", NOMINAL)
-    config.write(tmp_path / "site.yaml", BENCH)
+    settings_file.write(tmp_path / "site.yaml", BENCH)
     session = Session.create(
         tmp_path / "session",
         procedure=Document("one.yaml", ONE),
@@ -314,7 +320,7 @@ def test_where_the_history_does_not_reach_back_the_step_is_asked_again_with_the_
 def test_a_step_whose_recording_has_a_hole_is_done_again_and_then_counts(session: Session) -> None:
     pose = ONE[ONE.index("{id") : ONE.index("]")]
     twice = ONE.replace(pose, f"{pose}, {pose.replace('z-up', 'again')}")
-    procedure = config.parse_text(twice.encode(), Procedure, "twice.yaml")
+    procedure = settings_file.parse_text(twice.encode(), Procedure, "twice.yaml")
     batches = performed(technician(procedure, calibration=NOMINAL))
     aligning = int(batches[250].pulses["counter"][0])
     conducted(session, list(batches), dropped=range(aligning, aligning + 200))
@@ -338,7 +344,9 @@ def test_evidence_is_whole_though_the_worker_is_held_up_for_as_long_as_a_step_ta
 ) -> None:
     done = technician(PROCEDURE, calibration=NOMINAL)
     stays = Segment(rest=Rest(duration_s=1000.0))
-    config.write(tmp_path / "technician.yaml", done.model_copy(update={"motion": (*done.motion, stays)}))
+    settings_file.write(
+        tmp_path / "technician.yaml", done.model_copy(update={"motion": (*done.motion, stays)})
+    )
     settings = Settings(
         port=f"sim://{tmp_path / 'technician.yaml'}?speed=20",
         profile="imu50-rs422",
@@ -407,7 +415,7 @@ def found(monkeypatch: pytest.MonkeyPatch) -> None:
     """A result without recordings to it."""
 
     nothing: Any = None
-    monkeypatch.setattr(Session, "identify", lambda _: conducts.Result(nothing, NOMINAL))
+    monkeypatch.setattr(Session, "identify", lambda _: Result(nothing, NOMINAL))
 
 
 def test_a_result_that_is_turned_down_changes_nothing(
@@ -447,5 +455,5 @@ def test_steps_left_are_those_not_done_with_all_that_they_had() -> None:
     text = ONE.replace(
         "poses: [", "poses: [{id: a, up: +X, east: +Y, turn_deg: -180, align_s: 40, repeats: 2}, "
     )
-    procedure = config.parse_text(text.encode(), Procedure, "two.yaml")
+    procedure = settings_file.parse_text(text.encode(), Procedure, "two.yaml")
     assert steps_left(procedure, ["a-1"]).steps == procedure.steps[1:]

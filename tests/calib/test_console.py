@@ -13,9 +13,10 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from calib import letters
-from calib.console import UNHEARD, UNREADABLE, Keys, Screen, plain, screen, with_port_state
-from calib.events import Abort, Confirm, Phase, Redo, Skip, View
+from calib.bench import block_letters
+from calib.bench.keys import Keys
+from calib.bench.screen import UNHEARD, UNREADABLE, Screen, plain, screen, with_port_state
+from calib.procedure.events import Abort, Confirm, Phase, Redo, Skip, View
 from imudrv.diagnosis import LineState
 
 DEADLINE_S = 20.0
@@ -92,16 +93,16 @@ def test_every_screen_fits_and_keeps_its_height(headline: str, size: tuple[int, 
 def test_the_headline_is_drawn_in_letters_at_least_three_rows_high_on_a_small_screen() -> None:
     for headline in HEADLINES:
         # what a screen of 80 by 24 has left beside the most that hints and reasons take
-        scale, lines = letters.fitted(headline, 78, 8)
+        scale, lines = block_letters.fitted(headline, 78, 8)
         assert scale >= 1
-        assert letters.rows(lines, scale) <= 8
+        assert block_letters.rows(lines, scale) <= 8
         assert " ".join(lines) == headline
 
 
 def test_a_letter_is_what_it_looks_like() -> None:
-    assert letters.blocks("T", 2) == ["██████", "  ██  ", "  ██  ", "  ██  ", "  ██  "]
-    assert letters.blocks("T", 1) == ["▀█▀", " █ ", " ▀ "]
-    assert letters.blocks("T", 2, ascii_only=True)[0] == "######"
+    assert block_letters.blocks("T", 2) == ["██████", "  ██  ", "  ██  ", "  ██  ", "  ██  "]
+    assert block_letters.blocks("T", 1) == ["▀█▀", " █ ", " ▀ "]
+    assert block_letters.blocks("T", 2, ascii_only=True)[0] == "######"
 
 
 def test_bars_figures_and_reasons_are_on_the_screen() -> None:

@@ -8,7 +8,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import simpson
 
-from calib.dither import Dither, compensated, dither_text, gain, in_increments, of_case, size_effect
+from calib.dither.spectrum import Dither, compensated, gain, in_increments, of_case, size_effect
+from calib.dither.text import dither_text
 from imudrv import profiles
 from imudrv.calibration import Calibration
 from imudrv.errors import InputError

@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.engine import (
+from calib.detection.acceptance import judge
+from calib.detection.segments import find_segments
+from calib.procedure.engine import (
     Abort,
     Aborted,
     Accepted,
@@ -28,9 +30,8 @@ from calib.engine import (
     Skipped,
     View,
 )
-from calib.procedure import Procedure
-from calib.segments import find_segments, judge
-from imudrv.config import parse
+from calib.procedure.schema import Procedure
+from imudrv.files.settings_file import parse
 from imudrv.nav.earth import EARTH_RATE
 from imudrv.records import Flag, Records
 from imudrv.sim.scenario import NOMINAL

@@ -6,8 +6,9 @@ import pytest
 from numpy.typing import NDArray
 from size_effect import size_effect_rate
 
-from calib import gauge
-from calib.gauge import GAUGES, Arms, Gauge, convert, from_kalibr, from_psins, to_kalibr, to_psins
+from calib.lever_arms import gauge
+from calib.lever_arms.gauge import GAUGES, Arms, Gauge, convert
+from calib.lever_arms.interchange import from_kalibr, from_psins, to_kalibr, to_psins
 from imudrv.errors import InputError
 from imudrv.units import MM
 

@@ -12,12 +12,15 @@ import yaml
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from calib.identify import DIFFERENCES, SHIFT_FREE, Identification, Noise, Planned, joint, plain, predict
-from calib.runs import Priors, Run, collect
-from calib.segments import Limits
+from calib.detection.acceptance import Limits
+from calib.estimation.joint import Noise, joint
+from calib.estimation.plain import plain
+from calib.estimation.predict import Planned, predict
+from calib.estimation.result import DIFFERENCES, SHIFT_FREE, Identification
+from calib.estimation.runs import Priors, Run, collect
 from imudrv import profiles
 from imudrv.calibration import coefficients, read_calibration
-from imudrv.captures import Capture
+from imudrv.capture import Capture
 from imudrv.errors import InputError
 from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import rate_filter

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calib.low_pass import without_dither
+from calib.estimation.low_pass import without_dither
 from imudrv.records import INCREMENTS, Records
 
 HALF = 8

@@ -3,9 +3,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.procedure import Procedure, load, predicted, shipped
-from imudrv.config import parse
+from calib.procedure.plan import load, predicted, shipped
+from calib.procedure.schema import Procedure
 from imudrv.errors import FaultyFileError, InputError
+from imudrv.files.settings_file import parse
 from imudrv.site import Site
 from imudrv.units import MM
 

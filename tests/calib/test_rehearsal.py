@@ -8,11 +8,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from calib.engine import Accepted, Engine, Event, Finished, Phase, Rejected, Restarted
-from calib.identify import DIFFERENCES, Identification, joint
-from calib.procedure import Procedure, load, predicted
-from calib.rehearsal import Mistake, technician
-from calib.runs import collect
+from calib.bench.technician import Mistake, technician
+from calib.estimation.joint import joint
+from calib.estimation.result import DIFFERENCES, Identification
+from calib.estimation.runs import collect
+from calib.procedure.engine import Accepted, Engine, Event, Finished, Phase, Rejected, Restarted
+from calib.procedure.plan import load, predicted
+from calib.procedure.schema import Procedure
 from imudrv import Coefficients, Compensator, coefficients, load_profile, rate_filter
 from imudrv.errors import InputError
 from imudrv.records import Flag, Records

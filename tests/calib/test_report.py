@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from rich.cells import cell_len
 
-from calib.findings import Basis, Findings, find
-from calib.gauge import Arms, convert
-from calib.identify import LeftOut
-from calib.report import arms_text, report_html, report_text, verdict
+from calib.estimation.result import LeftOut
+from calib.identification import Basis, Findings, find
+from calib.lever_arms.gauge import Arms, convert
+from calib.reports.identification import arms_text, report_html, report_text, verdict
 from imudrv import profiles
 from imudrv.cli import main as imudrv
 from imudrv.sim.scenario import NOMINAL

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from calib.procedure import Step
-from calib.result import Attempt, require_covered, uncovered
+from calib.bench.evidence import Attempt, require_covered, uncovered
+from calib.procedure.schema import Step
 from imudrv import profiles
 from imudrv.errors import InputError
 

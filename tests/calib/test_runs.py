@@ -4,7 +4,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.runs import AFTER_S, BEFORE_S, Evidence, collect
+from calib.estimation.runs import AFTER_S, BEFORE_S, Evidence, collect
 from imudrv.errors import InputError
 from imudrv.records import Records
 from imudrv.site import Site

@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.segments import Limits, Rotation, Segments, expected_error_mm, find_segments, judge
+from calib.detection.acceptance import Limits, expected_error_mm, judge
+from calib.detection.segments import Rotation, Segments, find_segments
 from imudrv.errors import InputError
 from imudrv.records import Flag, Records
 

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.session import JOURNAL, Document, Session, verify
-from imudrv import config
+from calib.bench.session import JOURNAL, Document, Session
+from calib.bench.verify import verify
 from imudrv.calibration import write_calibration
 from imudrv.errors import InputError
+from imudrv.files import atomic, settings_file
 from imudrv.sim.scenario import NOMINAL
 from imudrv.site import Site
 
@@ -34,7 +35,7 @@ def begin(folder: Path) -> Session:
     """A session whose unit's papers are beside it."""
     papers = folder.parent
     write_calibration(papers / "unit.yaml", NOMINAL)
-    config.write(papers / "site.yaml", Site(latitude_deg=28.2, longitude_deg=113.0, height_m=60.0))
+    settings_file.write(papers / "site.yaml", Site(latitude_deg=28.2, longitude_deg=113.0, height_m=60.0))
     (papers / "bench.yaml").write_text(PROCEDURE)
     return Session.create(
         folder,
@@ -112,7 +113,7 @@ def test_the_first_line_holds_the_plan(folder: Path) -> None:
     certificate = folder.parent / "unit.yaml"
     assert plan["unit"] == "nominal"
     assert plan["procedure"]["text"] == PROCEDURE
-    assert plan["certificate"] == {"path": str(certificate), "sha256": config.sha256(certificate)}
+    assert plan["certificate"] == {"path": str(certificate), "sha256": atomic.sha256(certificate)}
     assert (folder / "before.yaml").read_bytes() == certificate.read_bytes()
     assert "latitude_deg: 28.2" in plan["site"]["text"]
 

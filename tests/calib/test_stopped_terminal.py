@@ -10,7 +10,8 @@ from pathlib import Path
 from threading import Event, Thread
 from typing import Any
 
-from calib.session import JOURNAL, verify
+from calib.bench.session import JOURNAL
+from calib.bench.verify import verify
 
 PROCEDURE = """
 format: imu50-procedure

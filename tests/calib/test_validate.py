@@ -12,15 +12,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calib import trials
 from calib.certificate import arms_of
-from calib.cli import main as calib
-from calib.document import as_html, as_text
-from calib.gauge import GAUGES, convert
-from calib.segments import Noise
-from calib.trials import Subject, campaign, scenario, subject, trial
-from calib.validate import Judged, Setting, Trial, judge, navigate, noise_velocity
-from calib.validation_report import document
+from calib.cli.main import main as calib
+from calib.detection.noise import Noise
+from calib.lever_arms.gauge import GAUGES, convert
+from calib.reports.html import as_html
+from calib.reports.text import as_text
+from calib.reports.validation import document
+from calib.validation import simulate as simulation
+from calib.validation.navigate import navigate
+from calib.validation.simulate import Subject, campaign, scenario, subject, trial
+from calib.validation.trial import Setting, Trial
+from calib.validation.verdict import Judged, judge, noise_velocity
 from imudrv import Capture, Compensator, coefficients, load_profile, rate_filter, write_calibration
 from imudrv.calibration import Calibration, SensingPoints, SizeEffect
 from imudrv.errors import InputError
@@ -169,7 +172,7 @@ def test_a_skew_is_estimated_with_a_rocking_and_put_right() -> None:
     made = short("rocking")
     unit = made.unit.model_copy(update={"accelerometer_skew_s": 1e-3})
     made = made.model_copy(update={"unit": unit})
-    who = subject(unit, 2, procedure=(*trials.PROCEDURE, "rocking"))
+    who = subject(unit, 2, procedure=(*simulation.PROCEDURE, "rocking"))
     (skew,) = (n for n in who.result.nuisances if n.name == "skew_s")
     assert skew.seen
     assert skew.value == pytest.approx(1e-3, abs=3.0 * skew.sigma)
@@ -234,9 +237,9 @@ def test_a_skew_is_not_put_right_over_a_gap(who: Subject) -> None:
 
 
 def test_a_campaign_gives_each_unit_its_trials(monkeypatch: pytest.MonkeyPatch, who: Subject) -> None:
-    monkeypatch.setattr(trials, "subject", lambda unit, seed: who)
-    monkeypatch.setattr(trials, "scenario", partial(short, after_s=3.0))
-    monkeypatch.setattr(trials, "trial", partial(trial, align_s=ALIGN_S))
+    monkeypatch.setattr(simulation, "subject", lambda unit, seed: who)
+    monkeypatch.setattr(simulation, "scenario", partial(short, after_s=3.0))
+    monkeypatch.setattr(simulation, "trial", partial(trial, align_s=ALIGN_S))
     said: list[str] = []
     made = list(campaign(["rotation"], [1, 2], "centred", said.append))
     assert [one.name for one in made] == ["rotation, unit 1", "rotation, unit 2"]

@@ -5,7 +5,7 @@ import pytest
 
 from imudrv import load_profile
 from imudrv.ports import Arrival, Port, PortEndedError, open_port
-from imudrv.profiles import Profile
+from imudrv.profiles.schema import Profile
 
 PATIENCE_S = 20.0
 

@@ -7,7 +7,7 @@ from mcap.writer import Writer
 from imudrv import Source
 from imudrv.errors import InputError
 from imudrv.ports import PortEndedError, PortLostError, open_port
-from imudrv.recording import BYTES, CAN_MESSAGES, WIRE, pack_messages
+from imudrv.recording.format import BYTES, CAN_MESSAGES, WIRE, pack_messages
 from imudrv.records import MESSAGE
 from imudrv.wire.candump import format_candump
 

@@ -9,10 +9,9 @@ from imudrv import profiles
 from imudrv.errors import InputError
 from imudrv.hostclock import now_ns
 from imudrv.ports import Arrival, Port, PortEndedError, PortLostError, open_port
-from imudrv.records import MESSAGE
+from imudrv.records import MESSAGE, Source
 from imudrv.sim.capture import wire
 from imudrv.sim.scenario import load
-from imudrv.wire.datagram import Source
 
 SCENARIO = """
 format: imu50-scenario

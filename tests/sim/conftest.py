@@ -3,7 +3,7 @@ from typing import Any
 
 import pytest
 
-from imudrv.config import parse
+from imudrv.files.settings_file import parse
 from imudrv.sim.scenario import Scenario
 
 SITE = {"latitude_deg": 28.2, "longitude_deg": 113.0, "height_m": 60.0, "gravity_m_s2": 9.79}

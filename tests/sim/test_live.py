@@ -20,8 +20,9 @@ import can
 import numpy as np
 import pytest
 
-from imudrv import config, profiles
+from imudrv import profiles
 from imudrv.errors import InputError
+from imudrv.files import settings_file
 from imudrv.records import Records
 from imudrv.sim import links
 from imudrv.sim.capture import wire
@@ -391,7 +392,7 @@ def stopped_terminal() -> Iterator[int]:
 def test_a_command_whose_text_nobody_takes_sends_all_the_same(
     output: Callable[[], AbstractContextManager[int]], code: int, message: str, run: Scenario, tmp_path: Path
 ) -> None:
-    config.write(tmp_path / "run.yaml", run)
+    settings_file.write(tmp_path / "run.yaml", run)
     command = [sys.executable, "-m", "imudrv", "sim", "run.yaml", "--profile", "imu50-rs422", "--port", "pty"]
     with output() as stdout:
         process = subprocess.Popen(
@@ -409,7 +410,7 @@ def test_a_command_whose_text_nobody_takes_sends_all_the_same(
 
 
 def test_a_command_without_a_standard_output_sends_all_the_same(run: Scenario, tmp_path: Path) -> None:
-    config.write(tmp_path / "run.yaml", run)
+    settings_file.write(tmp_path / "run.yaml", run)
     command = f"{sys.executable} -m imudrv sim run.yaml --profile imu50-rs422 --port pty --link imu >&-"
     process = subprocess.Popen(command, shell=True, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
     try:

@@ -5,8 +5,8 @@ from typing import Any
 import pytest
 
 from imudrv.calibration import Calibration
-from imudrv.config import write
 from imudrv.errors import FaultyFileError, InputError
+from imudrv.files.settings_file import write
 from imudrv.sim.scenario import NOMINAL, Scenario, load, shipped
 from imudrv.sim.unit import simulate
 

@@ -4,9 +4,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from imudrv.records import INCREMENTS, PULSES
+from imudrv.records import INCREMENTS, PULSES, Source
 from imudrv.sinks.base import Batch
-from imudrv.wire.datagram import Source, encode
+from imudrv.wire.datagram import encode
 
 BatchMaker = Callable[[int, int], Batch]
 Waiter = Callable[[Callable[[], object]], None]

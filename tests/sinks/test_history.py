@@ -8,8 +8,7 @@ import pytest
 
 from imudrv import profiles
 from imudrv.imu.sequence import SequenceTracker
-from imudrv.ports.base import Arrival
-from imudrv.records import INCREMENTS, PULSES, Records
+from imudrv.records import INCREMENTS, PULSES, Arrival, Records
 from imudrv.sinks.base import Batch
 from imudrv.sinks.history import MAX_BYTES, History, Moment
 from imudrv.wire.datagram import SIZE

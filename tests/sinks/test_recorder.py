@@ -17,12 +17,11 @@ from mcap.reader import NonSeekingReader, make_reader
 
 from imudrv import profiles
 from imudrv.errors import InputError
-from imudrv.ports.base import Arrival
-from imudrv.recording import Recording
-from imudrv.records import MESSAGE
+from imudrv.recording.reader import Recording
+from imudrv.records import MESSAGE, Arrival, Source
 from imudrv.sinks import recorder as recorder_module
 from imudrv.sinks.recorder import Recorder
-from imudrv.wire.datagram import SIZE, Source
+from imudrv.wire.datagram import SIZE
 
 PROFILES = Path(profiles.__file__).parent
 
@@ -306,7 +305,7 @@ def test_a_kill_loses_nothing_that_was_read_a_quarter_of_a_second_before(tmp_pat
 
 def test_nothing_that_waits_is_without_bound(batch, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(recorder_module, "QUEUE_BYTES", 100 * (SIZE + 64))
-    monkeypatch.setattr("imudrv.sinks.spool.PERIOD_S", 3600)
+    monkeypatch.setattr("imudrv.files.spool.PERIOD_S", 3600)
     recorder = open_recorder(tmp_path / "run.mcap")
     for n in range(1000):
         recorder.arrived(Arrival(n, b"x" * SIZE))

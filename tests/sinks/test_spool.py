@@ -2,8 +2,8 @@ from pathlib import Path
 
 import pytest
 
-from imudrv.sinks import spool
-from imudrv.sinks.spool import Piece, Spool
+from imudrv.files import spool
+from imudrv.files.spool import Piece, Spool
 
 
 def test_a_round_ends_with_what_had_waited_though_more_comes_meanwhile(

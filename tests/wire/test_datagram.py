@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from imudrv.records import INCREMENTS, Records
-from imudrv.wire.datagram import SIZE, DatagramDecoder, Source, encode
+from imudrv.records import INCREMENTS, Records, Source
+from imudrv.wire.datagram import SIZE, DatagramDecoder, encode
 
 # ICD, section 7.
 WORKED = bytes.fromhex(

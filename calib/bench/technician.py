@@ -1,0 +1,277 @@
+"""The technician that is not there: a procedure, mistakes if you like, as a scenario of the simulated unit.
+
+The technician sets the unit down in the first pose, waits for the preflight, and for each step carries it
+into its pose, rests, turns it, rests; hands tremble while they carry. A mistake is made in its step, what the
+engine says is heeded, and the step is done again. The times are those of the engine with `hands_free`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import radians
+from typing import Final, Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation as Attitude
+
+from calib.axes import side
+from calib.procedure.engine import PREFLIGHT_S
+from calib.procedure.plan import TURN_S
+from calib.procedure.prompts import READY_S
+from calib.procedure.schema import Procedure, Step
+from imudrv.arrays import Array
+from imudrv.calibration import Calibration, SensingPoints, SizeEffect
+from imudrv.errors import InputError
+from imudrv.nav.attitude import rotation
+from imudrv.sim.motion import start_attitude
+from imudrv.sim.scenario import (
+    NOMINAL,
+    Faults,
+    Noise,
+    Residuals,
+    Rest,
+    Rock,
+    Rotate,
+    Scenario,
+    Segment,
+    Start,
+    Unit,
+    Unplug,
+)
+from imudrv.site import Site
+
+Kind = Literal["moves", "wrong way", "short", "slow", "wrong pose", "bump", "unplug"]
+
+
+BENCH: Final = Site(latitude_deg=28.2, longitude_deg=113.0, height_m=60.0)
+"""Where the rehearsal takes place."""
+
+
+REACTION_S: Final = 4.0
+"""From the engine's word to the deed, s."""
+
+
+CARRY_DEG_PER_S: Final = 45.0
+"""Mean rate of a unit that is carried into another pose."""
+
+
+ARM_MM: Final = 18.0
+"""Sensing points are drawn so far from their centroid along each axis, 1 sigma."""
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """What goes wrong in a step.
+
+    Attributes
+    ----------
+    step_id : str
+        The step.
+    kind : str
+        'moves': touches the unit during the alignment. 'wrong way': turns it the other way first. 'short':
+        150 deg only. 'slow': in 8 s. 'wrong pose': puts another side up first. 'bump': bumps the bench in the
+        rest after the turn. 'unplug': the cable comes out for 3 s during the alignment.
+    """
+
+    step_id: str
+    kind: Kind
+
+
+def technician(
+    procedure: Procedure,
+    mistakes: Sequence[Mistake] = (),
+    *,
+    seed: int = 1,
+    site: Site = BENCH,
+    calibration: Calibration | None = None,
+) -> Scenario:
+    """Make the scenario of a procedure carried out by hand.
+
+    Parameters
+    ----------
+    procedure : Procedure
+        What is carried out.
+    mistakes : sequence of Mistake
+        What goes wrong on the way; one a step at the most. Each is made good.
+    seed : int
+        Draws the unit's errors, its arms, and how the technician's hands go.
+    site : Site
+        Where.
+    calibration : Calibration, optional
+        Certificate of the unit; its `size_effect` is the truth. Not given: the nominal unit with drawn arms.
+
+    Returns
+    -------
+    Scenario
+        `unit.calibration` is the certificate with the true arms; the engine is to get it without them.
+
+    Raises
+    ------
+    InputError
+        A mistake in a step that there is not, or two in one.
+    """
+    kinds = {mistake.step_id: mistake.kind for mistake in mistakes}
+    known = [step.id for step in procedure.steps]
+    if len(kinds) != len(mistakes) or not kinds.keys() <= set(known):
+        raise InputError(
+            f"rehearsal: expected mistakes in different steps of {', '.join(known)}, "
+            f"got {', '.join(m.step_id for m in mistakes)}"
+        )
+    rng = np.random.default_rng(seed)
+    calibration = calibration or _drawn(rng)
+    hands = _Hands(procedure, rng)
+    for step in procedure.steps:
+        hands.do(step, kinds.get(step.id))
+    hands.rest(REACTION_S)
+    return Scenario(
+        format="imu50-scenario",
+        version=1,
+        seed=seed,
+        site=site,
+        start=hands.start,
+        motion=tuple(hands.motion),
+        unit=Unit(
+            calibration=calibration,
+            residuals=Residuals(
+                gyro_bias_deg_per_h=0.01,
+                gyro_scale_ppm=5.0,
+                gyro_misalignment_urad=30.0,
+                accelerometer_bias_ug=50.0,
+                accelerometer_scale_ppm=20.0,
+                accelerometer_misalignment_urad=30.0,
+            ),
+            noise=Noise(arw_deg_per_sqrt_h=0.002, vrw_m_s_per_sqrt_h=0.003),
+        ),
+        faults=Faults(unplugs=tuple(hands.unplugs)),
+    )
+
+
+def _drawn(rng: np.random.Generator) -> Calibration:
+    """Draw the nominal unit's arms, in gauge centroid."""
+    r_mm = np.round(rng.normal(0.0, ARM_MM, (3, 3)), 3)
+    r_mm[2] = -r_mm[0] - r_mm[1]
+    x, y, z = (tuple(row) for row in np.round(r_mm, 3).tolist())
+    size_effect = SizeEffect(r_mm=SensingPoints(x=x, y=y, z=z), gauge="centroid")
+    return NOMINAL.model_copy(update={"serial_number": "rehearsal", "size_effect": size_effect})
+
+
+class _Hands:
+    """The technician's hands: what they do becomes the motion."""
+
+    def __init__(self, procedure: Procedure, rng: np.random.Generator) -> None:
+        self._procedure, self._rng = procedure, rng
+        self.motion: list[Segment] = []
+        self.unplugs: list[Unplug] = []
+        self._t_s = 0.0
+        first = self._pose(procedure.steps[0])
+        self.start = _start(procedure.steps[0], first)
+        self._C_nb = start_attitude(self.start)
+        if procedure.steps[0].up[0] == "-":
+            self._carry(first)
+        self.rest(PREFLIGHT_S + REACTION_S)
+
+    def do(self, step: Step, mistake: Kind | None) -> None:
+        """Carry a step out."""
+        turn_s = TURN_S * self._rng.uniform(0.9, 1.1)
+        turn_deg = step.turn_deg + self._rng.uniform(-1.5, 1.5)
+        sign = np.sign(step.turn_deg)
+        if mistake == "wrong pose":
+            self._carry(self._wrong_pose(step))
+            self.rest(2.0 * REACTION_S)
+        if not self._stands(step):
+            self._carry(self._pose(step))
+        before_s = READY_S + self._procedure.limits.still_s
+        if mistake == "moves":
+            self.rest(before_s + 0.6 * step.align_s)
+            self._turn(2.0, 1.0)
+        elif mistake == "unplug":
+            self.rest(before_s + 0.5 * step.align_s)
+            self.unplugs.append(Unplug(at_s=self._t_s, duration_s=3.0))
+            self.rest(3.0)
+        elif mistake is not None and mistake != "wrong pose":
+            self._align(step)
+            first_deg, first_s = {
+                "wrong way": (-40.0 * sign, 1.0),
+                "short": (150.0 * sign, turn_s),
+                "slow": (180.0 * sign, 8.0),
+                "bump": (turn_deg, turn_s),
+            }[mistake]
+            self._turn(first_deg, first_s)
+            self.rest(REACTION_S)
+            if mistake == "bump":
+                self._turn(0.5, 0.2)
+                self.rest(REACTION_S)
+            self._turn(-first_deg, 4.0)
+        self._align(step)
+        self._turn(turn_deg, turn_s)
+        self.rest(step.rest_s + REACTION_S)
+
+    def rest(self, duration_s: float) -> None:
+        """Keep off."""
+        self._add(Segment(rest=Rest(duration_s=duration_s)), duration_s)
+
+    def _align(self, step: Step) -> None:
+        limits = self._procedure.limits
+        self.rest(READY_S + limits.still_s + step.align_s + REACTION_S)
+
+    def _turn(self, angle_deg: float, duration_s: float) -> None:
+        """Turn about the vertical, or nearly so."""
+        lean = self._rng.normal(0.0, 2.0, 2) * 1e-3
+        axis = (float(lean[0]), float(lean[1]), 1.0)
+        self._about(axis, angle_deg, duration_s)
+
+    def _about(self, axis_n: tuple[float, float, float], angle_deg: float, duration_s: float) -> None:
+        rotate = Rotate(angle_deg=angle_deg, duration_s=duration_s, axis_n=axis_n)
+        self._add(Segment(rotate=rotate), duration_s)
+        self._C_nb = rotation(axis_n, radians(angle_deg)) @ self._C_nb
+
+    def _carry(self, C_nb: Array) -> None:
+        """Lift the unit, turn it, and set it down."""
+        self._tremble()
+        turn = Attitude.from_matrix(C_nb @ self._C_nb.T).as_rotvec()
+        angle = float(np.linalg.norm(turn))
+        x, y, z = (turn / angle).tolist()
+        self._about((x, y, z), float(np.degrees(angle)), 1.0 + float(np.degrees(angle)) / CARRY_DEG_PER_S)
+        self._tremble()
+
+    def _tremble(self) -> None:
+        rock = Rock(
+            duration_s=2.0,
+            band_hz=(0.5, 4.0),
+            ramp_s=0.5,
+            rate_rms_deg_per_s=(3.0, 3.0, 3.0),
+            sway_mm=(5.0, 5.0, 5.0),
+        )
+        self._add(Segment(rock=rock), 2.0)
+
+    def _add(self, segment: Segment, duration_s: float) -> None:
+        self.motion.append(segment)
+        self._t_s += duration_s
+
+    def _pose(self, step: Step) -> Array:
+        """The pose of a step, as well as a person sets it down."""
+        heading = rotation((0.0, 0.0, 1.0), radians(self._rng.uniform(-8.0, 8.0)))
+        lean = Attitude.from_rotvec([*(self._rng.normal(0.0, 1e-3, 2)), 0.0]).as_matrix()
+        C_nb: Array = lean @ heading @ step.C_bn.T
+        return C_nb
+
+    def _wrong_pose(self, step: Step) -> Array:
+        """Another side up: the one that should look north."""
+        C_nb: Array = rotation((1.0, 0.0, 0.0), radians(90.0)) @ self._pose(step)
+        return C_nb
+
+    def _stands(self, step: Step) -> bool:
+        """Whether the unit stands as the step wants it."""
+        off = Attitude.from_matrix(self._C_nb @ step.C_bn)
+        return bool(off.magnitude() < radians(20.0))
+
+
+def _start(step: Step, C_nb: Array) -> Start:
+    """Where the unit stands at first: in the step's pose, or Z up where that side is underneath."""
+    pose: Literal["x_up", "y_up", "z_up"]
+    pose = {"X": "x_up", "Y": "y_up", "Z": "z_up"}[side(step.up)[-1]]  # type: ignore[assignment]
+    pivot_offset_mm = (40.0, 30.0, 30.0)
+    if step.up[0] == "-":
+        return Start(pivot_offset_mm=pivot_offset_mm)
+    upright = start_attitude(Start(pose=pose))
+    heading = -Attitude.from_matrix(C_nb @ upright.T).as_rotvec()[2]
+    return Start(pose=pose, heading_deg=float(np.degrees(heading)), pivot_offset_mm=pivot_offset_mm)

@@ -1,0 +1,1 @@
+"""The command `calib`: one module a group of commands."""

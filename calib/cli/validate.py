@@ -1,0 +1,93 @@
+"""Command `calib validate`."""
+
+import argparse
+from collections.abc import Iterator
+from contextlib import nullcontext
+from typing import Final
+
+from rich.console import Console
+
+from calib.certificate import arms_of
+from calib.cli.arguments import check_output
+from calib.reports.html import as_html
+from calib.reports.text import as_text, for_terminal
+from calib.reports.validation import document
+from calib.validation.navigate import navigate
+from calib.validation.simulate import TRIALS, askew, campaign, dithering
+from calib.validation.trial import Setting, Trial
+from calib.validation.verdict import Judged, judge
+from imudrv import profiles
+from imudrv.calibration import Calibration, read_calibration
+from imudrv.capture import Capture
+from imudrv.errors import InputError
+from imudrv.files import settings_file
+from imudrv.files.atomic import replacing
+from imudrv.site import Site
+from imudrv.terminal import OK, progress
+
+NOT_GOOD: Final = 3
+"""Exit code: a verdict is bad."""
+
+
+def run_validate(arguments: argparse.Namespace) -> int:
+    """Judge recordings, or simulated units."""
+    if (arguments.simulate is None) == (not arguments.recordings):
+        raise InputError("validate: expected either recordings or --simulate")
+    if arguments.report is not None:
+        inputs = (*arguments.recordings, arguments.profile, arguments.calibration, arguments.site)
+        check_output(arguments.report, *inputs)
+    if arguments.simulate is not None:
+        trials = [(trial, judge(trial)) for trial in _simulated(arguments)]
+        shown = sum(trial.name.endswith("unit 1") for trial, _ in trials)
+        told = document("a simulated unit", trials, shown)
+        required = [judged for trial, judged in trials if "unit" in trial.name]
+    else:
+        calibration, trials = _navigated(arguments)
+        told = document(f"unit {calibration.serial_number}", trials, len(trials))
+        required = [judged for _, judged in trials]
+    if arguments.report is not None:
+        with replacing(arguments.report) as file:
+            file.write(as_html(told).encode())
+    console = Console(highlight=False)
+    if console.is_terminal:
+        console.print(for_terminal(told))
+    else:
+        print(as_text(told), end="")
+    return OK if all(judged.good for judged in required) else NOT_GOOD
+
+
+def _simulated(arguments: argparse.Namespace) -> Iterator[Trial]:
+    which, seeds, name = arguments.simulate, arguments.seeds, arguments.rate_filter
+    if seeds < 1:
+        raise InputError(f"--seeds: expected 1 or more, got {seeds}")
+    console = Console(stderr=True)
+    names = tuple(TRIALS) if which == "all" else (which,)
+    with console.status("simulate") if console.is_terminal else nullcontext() as status:
+        yield from campaign(names, range(1, seeds + 1), name, status.update if status else lambda _: None)
+        if which == "all":
+            yield from askew(1)
+            yield from dithering(1)
+
+
+def _navigated(arguments: argparse.Namespace) -> tuple[Calibration, list[tuple[Trial, Judged]]]:
+    if arguments.calibration is None or arguments.site is None:
+        raise InputError("validate: expected --calibration and --site with recordings")
+    calibration = read_calibration(arguments.calibration)
+    arms_of(calibration, str(arguments.calibration))
+    site = settings_file.read(arguments.site, Site)
+    profile = profiles.load(arguments.profile) if arguments.profile else None
+    found = []
+    for path in arguments.recordings:
+        capture = Capture(path, profile, arguments.channel)
+        setting = Setting(
+            capture.layout,
+            calibration,
+            site,
+            arguments.align,
+            arguments.rate_filter,
+            arguments.skew_ms * 1e-3,
+        )
+        with progress(path.name, capture.size) as advance:
+            trial = navigate(path.name, capture.pulses(advance), setting)
+        found.append((trial, judge(trial)))
+    return calibration, found

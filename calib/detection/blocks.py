@@ -1,0 +1,128 @@
+"""Blocks of 20 ms, by the counter."""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imudrv.records import Records
+from imudrv.units import NS
+from imudrv.vectors import Vector
+
+
+class Block(NamedTuple):
+    """20 ms of samples."""
+
+    rows: Records
+    last: int  # counter of the last sample
+    seconds: float  # that the samples cover
+    dtheta: Vector  # rad, body axes
+    force: Vector  # mean, m/s^2
+    flags: int  # of any sample
+    missing: int  # samples since the block before's last that are not there
+    hole: bool  # too much is missing to tell rest from motion
+    restarted: bool  # the counter began anew
+
+
+class Cutter:
+    """Cuts samples into blocks that the counter bounds, however they come in."""
+
+    def __init__(self, interval_ns: int) -> None:
+        self._size = max(1, BLOCK_NS // interval_ns)
+        self._waiting: list[Records] = []
+        self._newest: int | None = None  # counter of the newest sample
+        self._restarts = 0
+        self._began(0)
+
+    def _began(self, counter: int) -> None:
+        """The counter begins here."""
+        self._origin = counter
+        self._index, self._last = -1, counter - 1  # of the newest block handed on
+        self._waiting.clear()
+
+    def feed(self, increments: Records) -> list[Block]:
+        """Take samples and give the blocks that are complete."""
+        if not len(increments):
+            return []
+        counter = increments["counter"]
+        if self._newest is None:
+            self._newest = int(counter[0]) - 1
+            self._began(int(counter[0]))
+        back = np.flatnonzero(np.diff(counter, prepend=self._newest) <= 0)
+        self._newest = int(counter[-1])
+        if not len(back):
+            return self._more(increments)
+        blocks = []
+        for k, piece in enumerate(np.split(increments, back)):
+            if k:
+                self._began(int(piece["counter"][0]))
+                self._restarts += 1
+            if len(piece):
+                blocks += self._more(piece)
+        return blocks
+
+    def _more(self, rows: Records) -> list[Block]:
+        self._waiting.append(rows)
+        newest = int(rows["counter"][-1])
+        first = (int(self._waiting[0]["counter"][0]) - self._origin) // self._size
+        if newest < self._end(first):
+            return []
+        rows = np.concatenate(self._waiting) if len(self._waiting) > 1 else rows
+        self._waiting.clear()
+        index = (rows["counter"] - self._origin) // self._size
+        if newest < self._end(int(index[-1])):
+            whole = int(np.searchsorted(index, index[-1]))
+            self._waiting.append(rows[whole:])
+            rows, index = rows[:whole], index[:whole]
+        return self._blocks(rows, index)
+
+    def _end(self, index: int) -> int:
+        """Counter of a block's last sample."""
+        return self._origin + (index + 1) * self._size - 1
+
+    def _blocks(self, rows: Records, index: NDArray[np.int64]) -> list[Block]:
+        starts = np.concatenate([[0], np.flatnonzero(np.diff(index)) + 1])
+        stops = np.append(starts[1:], len(rows))
+        index, last = index[starts], rows["counter"][stops - 1]
+        interval_ns = np.add.reduceat(rows["interval_ns"], starts)
+        missing = np.diff(last, prepend=self._last) - (stops - starts)
+        hole = (2 * missing >= self._size) | (np.diff(index, prepend=self._index) > 1)
+        seconds = interval_ns * NS
+        dtheta = np.add.reduceat(rows["dtheta_b"], starts)
+        force = np.add.reduceat(rows["dv_b"], starts) / seconds[:, None]
+        flags = np.bitwise_or.reduceat(rows["flags"], starts)
+        restarted = self._index < 0 < self._restarts
+        self._index, self._last = int(index[-1]), int(last[-1])
+        columns = (a.tolist() for a in (starts, stops, last, seconds, dtheta, force, flags, missing, hole))
+        return [
+            Block(rows[a:b], at, s, tuple(w), tuple(f), bits, lost, empty, restarted and not a)
+            for a, b, at, s, w, f, bits, lost, empty in zip(*columns, strict=True)
+        ]
+
+
+BLOCK_NS: Final = 20_000_000
+"""Samples are summed over so long, ns."""
+
+
+BLOCK: Final = np.dtype(
+    [
+        ("index", np.int64),  # of the block, by the counter
+        ("samples", np.int64),
+        ("interval_ns", np.int64),
+        ("dtheta_b", np.float64, 3),
+        ("dv_b", np.float64, 3),
+        ("angle", np.float64, 3),  # sum over the samples of the angle since the block's beginning
+        ("velocity", np.float64, 3),  # likewise
+        ("flags", np.int64),  # of any sample
+    ]
+)
+
+
+def join_blocks(block: Records, more: Records) -> None:
+    """Add to a block, in place, what a later piece has of it."""
+    for whole, inside in (("dtheta_b", "angle"), ("dv_b", "velocity")):
+        block[inside] += more[inside] + more["samples"] * block[whole]
+        block[whole] += more[whole]
+    for name in ("samples", "interval_ns"):
+        block[name] += more[name]
+    block["flags"] |= more["flags"]

@@ -1,0 +1,205 @@
+"""What samples tell about motion as they come: rest, gravity, attitude, a turn; in blocks of 20 ms.
+
+The counter bounds the blocks, so that any cut into pieces gives the same ones. What counts as motion is the
+rule of `calib.detection.segments`, which judges the whole afterwards.
+"""
+
+from collections import deque
+from math import acos, atan2, hypot, pi
+from typing import Final
+
+import numpy as np
+
+from calib.axes import axis_name
+from calib.detection.blocks import BLOCK_NS, Block
+from imudrv.arrays import Array
+from imudrv.nav.attitude import Quaternion, conjugate, product, quaternion_of_vector, turn, unit
+from imudrv.nav.earth import earth_rate_n
+from imudrv.units import DEG, NS, STANDARD_GRAVITY
+from imudrv.vectors import Vector, add, dot, scale, subtract
+
+SMOOTH_S: Final = 0.2
+"""Gravity is smoothed over so long while the unit is carried, s."""
+
+
+MG: Final = 1e-3 * STANDARD_GRAVITY
+"""One milli-g, m/s^2."""
+
+
+class Stillness:
+    """Whether the unit stands still, by the rule of `calib.detection.segments`, as the samples come."""
+
+    def __init__(self, rate_limit: float, force_limit: float) -> None:
+        self.moving = False
+        self.quiet_s = 0.0  # since the last motion
+        self.rate = 0.0  # rad/s
+        self._recent: deque[float] = deque([10.0], maxlen=round(0.5 / (BLOCK_NS * NS)))
+        self._over = 0.0
+        self._off = 0.0
+        self._force = (0.0, 0.0, 0.0)  # sum since the last motion
+        self._blocks = 0
+        self.limit(rate_limit, force_limit)
+
+    def limit(self, rate: float, force: float) -> None:
+        """What counts as motion: a rate of more, rad/s, or a change of specific force, m/s^2."""
+        self._rate_limit, self._force_limit = rate, force
+
+    def feed(self, block: Block) -> None:
+        """Take a block."""
+        self.rate = hypot(*block.dtheta) / block.seconds
+        over, off = self.rate / self._rate_limit, 0.0
+        if self._blocks:
+            off = hypot(*subtract(block.force, scale(1.0 / self._blocks, self._force))) / self._force_limit
+        lost = block.hole or block.restarted
+        self._recent.append(10.0 if lost else max(over, off))
+        self.moving = lost or max(over, off) > 1.0
+        if self.moving:
+            self._over, self._off = over, off
+            self.quiet_s, self._blocks, self._force = 0.0, 0, (0.0, 0.0, 0.0)
+        else:
+            self.quiet_s += block.seconds
+            self._blocks += 1
+            self._force = add(self._force, block.force)
+
+    @property
+    def stillness(self) -> float:
+        """As in `View`."""
+        return 1.0 - min(1.0, max(0.0, max(self._recent) - 1.0) / 9.0)
+
+    @property
+    def why(self) -> str:
+        """Latest motion, with its number and limit."""
+        if self._over >= self._off:
+            return f"{self._over * self._rate_limit / DEG:.2f} deg/s, limit {self._rate_limit / DEG:.2f}"
+        mg = self._force_limit / MG
+        return f"specific force {self._off * mg:.1f} mg off its mean, limit {mg:.1f}"
+
+
+class Means:
+    """Mean readings of a rest, and their noise."""
+
+    def __init__(self) -> None:
+        self.flags = 0
+        self._rows: list[tuple[float, ...]] = []
+
+    def feed(self, block: Block) -> None:
+        """Take a block."""
+        self.flags |= block.flags
+        self._rows.append((*scale(1.0 / block.seconds, block.dtheta), *block.force))
+
+    @property
+    def rate(self) -> Array:
+        """Rad/s, shape (3,)."""
+        mean: Array = np.mean(self._rows, axis=0)[:3]
+        return mean
+
+    @property
+    def force(self) -> Array:
+        """m/s^2, shape (3,)."""
+        mean: Array = np.mean(self._rows, axis=0)[3:]
+        return mean
+
+    def forget(self, rate_limit: float, force_limit: float) -> int:
+        """Leave out all up to the last motion, which has a rate or a change of force of more; blocks kept."""
+        rows = np.array(self._rows).reshape(-1, 2, 3)
+        rate, off = rows[:, 0], rows[:, 1] - np.median(rows[:, 1], axis=0)
+        moving = (np.linalg.norm(rate, axis=1) > rate_limit) | (np.linalg.norm(off, axis=1) > force_limit)
+        if moving.any():
+            self._rows = self._rows[int(np.flatnonzero(moving)[-1]) + 1 :]
+        return len(self._rows)
+
+    def noise(self) -> tuple[float, float]:
+        """Rms of rate, rad/s, and specific force, m/s^2, in the quietest fifth of the seconds."""
+        a_second = round(1.0 / (BLOCK_NS * NS))
+        n = len(self._rows) // a_second
+        seconds = np.array(self._rows[: n * a_second]).reshape(n, a_second, 2, 3)
+        square = ((seconds - seconds.mean(axis=1, keepdims=True)) ** 2).sum(axis=3).mean(axis=1)
+        rate, force = np.sqrt(np.quantile(square, 0.2, axis=0)).tolist()
+        return rate, force
+
+
+class Posture:
+    """How the unit lies: gravity, and once an alignment has told it, attitude, carried on by the gyros.
+
+    Parameters
+    ----------
+    latitude_rad : float
+        Of the place.
+    """
+
+    def __init__(self, latitude_rad: float) -> None:
+        self.force: Vector | None = None  # smoothed, m/s^2
+        self.q_nb: Quaternion | None = None
+        self._earth_n = earth_rate_n(latitude_rad)
+
+    def feed(self, block: Block) -> None:
+        """Take a block."""
+        share = min(1.0, block.seconds / SMOOTH_S)
+        before = self.force or block.force
+        self.force = add(before, scale(share, subtract(block.force, before)))
+        if block.hole or block.restarted:
+            self.q_nb = None
+        elif self.q_nb is not None:
+            earth = quaternion_of_vector(scale(-block.seconds, self._earth_n))
+            self.q_nb = unit(product(earth, product(self.q_nb, quaternion_of_vector(block.dtheta))))
+
+    @property
+    def up(self) -> str:
+        """Body axis that is up, '+X' to '-Z'."""
+        return axis_name(np.array(self.force or (0.0, 0.0, 1.0)))
+
+    def lean(self, axis_b: Array) -> float:
+        """Angle between an axis and the vertical, rad."""
+        if self.force is None:
+            return pi
+        return acos(max(-1.0, min(1.0, dot(self.force, _vector(axis_b)) / hypot(*self.force))))
+
+    def azimuth(self, axis_b: Array) -> float | None:
+        """Direction of an axis, from north to east, rad, -pi to pi; None: not known."""
+        if self.q_nb is None:
+            return None
+        east, north, _ = turn(self.q_nb, _vector(axis_b))
+        return atan2(east, north)
+
+
+def _vector(v: Array) -> Vector:
+    x, y, z = v.tolist()
+    return x, y, z
+
+
+class Turn:
+    """A turn as it happens."""
+
+    def __init__(self, up_b: Vector = (0.0, 0.0, 1.0)) -> None:
+        self.begun: int | None = None  # counter
+        self.angle = 0.0  # about the vertical, rad
+        self.rate = 0.0  # about the vertical, rad/s
+        self.peak = 0.0  # rad/s
+        self._total = (0.0, 0.0, 0.0)
+        self._up_before = self._up = up_b
+
+    def feed(self, block: Block) -> None:
+        """Take a block."""
+        if self.begun is None:
+            self.begun = block.last
+        about_up = dot(block.dtheta, self._up)
+        self.angle += about_up
+        self.rate = about_up / block.seconds
+        self.peak = max(self.peak, hypot(*block.dtheta) / block.seconds)
+        self._total = add(self._total, block.dtheta)
+        self._up = turn(conjugate(quaternion_of_vector(block.dtheta)), self._up)
+
+    @property
+    def size(self) -> float:
+        """Of the whole turn, rad."""
+        return hypot(*self._total)
+
+    @property
+    def axis_tilt(self) -> float:
+        """Of its axis from the vertical, rad."""
+        return acos(min(1.0, abs(dot(self._total, self._up_before)) / self.size))
+
+    @property
+    def about(self) -> str:
+        """Body axis nearest to its axis, 'X', 'Y' or 'Z'."""
+        return axis_name(np.array(self._total))[1]

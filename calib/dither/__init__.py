@@ -1,0 +1,1 @@
+"""Effect of the gyro dither on the accelerometers."""

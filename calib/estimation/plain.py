@@ -1,0 +1,131 @@
+"""The literature's solution V = H R."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from calib.detection.noise import Noise
+from calib.estimation.linear_system import (
+    ROUNDING,
+    Unknowns,
+    bin_variance,
+    design_columns,
+    gain_rows,
+    noise_covariance,
+    parameter_groups,
+    prior_parameters,
+    rank_reason,
+    require_runs,
+    rest_noise,
+    run_result,
+    singular_values_of,
+    unobservable_text,
+    velocity_at_rest,
+    velocity_gain,
+    whole_bins,
+)
+from calib.estimation.result import SHIFT_FREE, Identification
+from calib.estimation.runs import Priors, Run
+from imudrv.arrays import Array
+from imudrv.errors import InputError
+
+
+def plain(runs: Sequence[Run], priors: Priors | None = None) -> Identification:
+    """Solve `V = H R`, the literature's way: one velocity for each rotation, nothing else estimated.
+
+    V and H are what the rotation gained: means over the half second after it less those before it. The
+    solution is that of least norm, which has its centroid in the origin. Its covariance is what bias,
+    misalignment and noise do to such a velocity, given that the alignment has made the rest before look
+    level.
+
+    Parameters
+    ----------
+    runs : sequence of Run
+        As for `joint`.
+    priors : Priors, optional
+        What the static calibration leaves.
+
+    Returns
+    -------
+    Identification
+
+    Raises
+    ------
+    InputError
+        No runs, or rotations that do not see the six differences.
+    """
+    priors = priors or Priors()
+    require_runs(runs)
+    noise = rest_noise(runs)
+    terms = parameter_groups(priors, ())
+    unknowns = prior_parameters(runs, priors, terms)
+    told = [velocity_gain(run) for run in runs]
+    V = np.concatenate([v[:2] for v, _ in told])
+    H = np.concatenate([h[:2] for _, h in told])
+    S = _plain_covariance(runs, noise, unknowns, terms)
+    sigma_v = float(np.sqrt(np.trace(S) / len(S)))
+    singular = singular_values_of(told)
+    s, directions = np.zeros(9), np.linalg.svd(H)[2]
+    s[: min(H.shape)] = np.linalg.svd(H, compute_uv=False)
+    sigma = sigma_v / np.maximum(s, ROUNDING * s[0])
+    rank = int((sigma < priors.arm).sum())
+    if rank < 6:
+        raise InputError(unobservable_text(sigma, directions.T, SHIFT_FREE, priors.arm))
+    inverse = SHIFT_FREE @ np.linalg.pinv(H @ SHIFT_FREE)
+    R = inverse @ V
+    rest = np.eye(len(V)) - H @ inverse  # what a solution of least squares leaves, not of least chi-square
+    left, freedom = rest @ V, max(0, len(V) - 6)
+    values, vectors = np.linalg.eigh(rest @ S @ rest.T)
+    of_left = (vectors.T @ left)[len(V) - freedom :]
+    return Identification(
+        method="plain",
+        gauge="centroid",
+        R_b=R.reshape(3, 3),
+        covariance=inverse @ S @ inverse.T,
+        rank=rank,
+        direction_sigma=sigma,
+        singular_values=singular,
+        reason=rank_reason(rank, sigma[rank - 1], sigma, priors.arm),
+        chi_square=float((of_left**2 / values[len(V) - freedom :]).sum()),
+        degrees_of_freedom=freedom,
+        noise=noise,
+        nuisances=(),
+        correlation=np.zeros((9, 0)),
+        left_out=(),
+        runs=tuple(
+            run_result(run, *told_run, R, *velocity_at_rest(run, R))
+            for run, told_run in zip(runs, told, strict=True)
+        ),
+        notes=(),
+    )
+
+
+def _plain_covariance(runs: Sequence[Run], noise: Noise, unknowns: Unknowns, terms: Sequence[str]) -> Array:
+    """Covariance of the stacked velocities of `velocity_gain`, from priors and noise.
+
+    The alignment has chosen tilt and heading so that the rest before shows no acceleration: what is not known
+    is what remains of the priors once that rest is seen.
+    """
+    known = np.diag(np.concatenate([np.full(9, 1e12), unknowns.sigma**-2]))  # R does not matter before
+    rows = []
+    S = np.zeros((2 * len(runs), 2 * len(runs)))
+    for k, run in enumerate(runs):
+        at = unknowns.columns_of(k, len(runs))
+        still = whole_bins(run.before, True)
+        columns = design_columns(run, terms)[:, :2]
+        A, t = columns[still].mean(axis=1), run.t_s[still].mean(axis=1)
+        single = [bin_variance(rest, noise) for rest in (run.rotation.before, run.rotation.after)]
+        K = noise_covariance(t, np.full(len(t), single[0]), noise, run.gravity)
+        white = solve_triangular(np.linalg.cholesky(K), A.reshape(len(t), -1), lower=True)
+        white = white.reshape(-1, A.shape[2])
+        known[np.ix_(at, at)] += white.T @ white
+        before, after = gain_rows(run)
+        row = np.zeros((2, len(known)))
+        row[:, at] = columns[after].mean(axis=0) - columns[before].mean(axis=0)
+        rows.append(row)
+        t = np.array([run.t_s[before].mean(), run.t_s[after].mean()])
+        K = noise_covariance(t, np.array(single), noise, run.gravity)
+        S[2 * k, 2 * k] = S[2 * k + 1, 2 * k + 1] = K[0, 0] + K[1, 1] - 2.0 * K[0, 1]
+    stacked = np.concatenate(rows)
+    return S + stacked @ np.linalg.solve(known, stacked.T)

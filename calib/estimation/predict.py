@@ -1,0 +1,167 @@
+"""Accuracy that a plan of rotations will give."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import hypot, tan
+from typing import Final
+
+import numpy as np
+from scipy.spatial.transform import Rotation as Attitude
+
+from calib.detection.blocks import BLOCK_NS
+from calib.detection.noise import Noise
+from calib.detection.segments import Rotation
+from calib.estimation.linear_system import (
+    TOLD_S,
+    NormalEquations,
+    parameter_groups,
+    prior_parameters,
+    run_equations,
+    unobservable_text,
+)
+from calib.estimation.result import DIFFERENCES, SHIFT_FREE
+from calib.estimation.runs import AFTER_S, BEFORE_S, GUARD_S, Priors, Run
+from imudrv.arrays import Array
+from imudrv.errors import InputError
+from imudrv.nav.alignment import ALIGNMENT_S, Aligned
+from imudrv.nav.earth import earth_rate_n, normal_gravity
+from imudrv.nav.mechanisation import Navigator
+from imudrv.records import INCREMENTS
+from imudrv.units import DEG, NS
+
+_PLAN_INTERVAL_NS: Final = 5_000_000
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A rotation that is planned.
+
+    Attributes
+    ----------
+    up : str
+        Body axis that points up, '+X' to '-Z'.
+    angle_deg : float
+        Right-handed about up.
+    duration_s : float
+        From rest to rest, with least jerk.
+    after_s : float
+        Rest after it.
+    offset_m : float
+        Distance of the origin of b from the axis of the rotation, through which a skew acts.
+    """
+
+    up: str
+    angle_deg: float = 180.0
+    duration_s: float = 2.5
+    after_s: float = 15.0
+    offset_m: float = 0.05
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a plan will give.
+
+    Attributes
+    ----------
+    covariance : ndarray, shape (9, 9)
+        Of (r_x, r_y, r_z) in gauge centroid, m^2.
+    differences_sigma : ndarray, shape (2, 3)
+        1-sigma of `r_x - r_y` and `r_x - r_z`, m.
+    """
+
+    covariance: Array
+    differences_sigma: Array
+
+
+def predict(
+    plan: Sequence[Planned], latitude_rad: float, noise: Noise, priors: Priors | None = None
+) -> Prediction:
+    """Covariance that a plan will give, from an ideal motion and without data.
+
+    Parameters
+    ----------
+    plan : sequence of Planned
+        The rotations.
+    latitude_rad : float
+        Of the place.
+    noise : Noise
+        Of the sensors, as an earlier session found it.
+    priors : Priors, optional
+        What the static calibration leaves.
+
+    Returns
+    -------
+    Prediction
+
+    Raises
+    ------
+    InputError
+        An empty plan, or one that does not see the six differences; says which it does not see.
+    """
+    priors = priors or Priors()
+    if not plan:
+        raise InputError("plan: expected one rotation at least, got none")
+    runs = [_ideal(planned, k, latitude_rad, priors) for k, planned in enumerate(plan)]
+    terms = parameter_groups(priors, ())
+    system = NormalEquations(
+        [run_equations(run, noise, "free", terms) for run in runs], prior_parameters(runs, priors, terms)
+    )
+    sigma, directions = system.directions()
+    if int((sigma < priors.arm).sum()) < 6:
+        raise InputError(unobservable_text(sigma, directions, SHIFT_FREE, priors.arm))
+    covariance = system.solve(SHIFT_FREE)[1][:9, :9]
+    spread = np.sqrt(np.diag(DIFFERENCES @ covariance @ DIFFERENCES.T))
+    return Prediction(covariance, spread.reshape(2, 3))
+
+
+def _ideal(planned: Planned, k: int, latitude_rad: float, priors: Priors) -> Run:
+    """The run that a planned rotation would make: level, about the vertical, nothing in error."""
+    T, n = _PLAN_INTERVAL_NS * NS, round(planned.duration_s / (_PLAN_INTERVAL_NS * NS))
+    before, after = round(BEFORE_S / T), round(min(planned.after_s, AFTER_S) / T)
+    up_b = np.array([planned.up == f"+{a}" for a in "XYZ"], np.float64)
+    up_b -= [planned.up == f"-{a}" for a in "XYZ"]
+    if not up_b.any() or n < 1 or after * T < TOLD_S:
+        raise InputError(
+            f"plan: expected an axis up from +X to -Z, a duration, and a rest of {TOLD_S:g} s at least, "
+            f"got {planned}"
+        )
+    u = np.clip((np.arange(before + n + after + 1) - before) / n, 0.0, 1.0)
+    angle = planned.angle_deg * DEG * u**3 * (10.0 - 15.0 * u + 6.0 * u * u)
+    gravity = normal_gravity(latitude_rad, 0.0)
+    C_nb0 = Attitude.align_vectors([[0.0, 0.0, 1.0]], [up_b])[0]
+    turned = Attitude.from_rotvec(np.outer(angle, [0.0, 0.0, 1.0]))
+    C_nb = turned * C_nb0
+    increments = np.zeros(len(angle) - 1, INCREMENTS)
+    increments["counter"] = np.arange(len(increments))
+    increments["interval_ns"] = _PLAN_INTERVAL_NS
+    increments["dtheta_b"] = np.outer(np.diff(angle), up_b) + T * C_nb[1:].inv().apply(
+        earth_rate_n(latitude_rad)
+    )
+    v_n = np.gradient(turned.apply([planned.offset_m, 0.0, 0.0]), T, axis=0)
+    increments["dv_b"] = gravity * T * up_b + C_nb[1:].inv().apply(np.diff(v_n, axis=0))
+    q_nb = np.roll(C_nb0.as_quat(), 1)
+    navigator = Navigator(
+        latitude_rad, 0.0, 0.0, None, q_nb, C_ba=np.eye(3), every=BLOCK_NS // _PLAN_INTERVAL_NS
+    )
+    rows = navigator.feed(increments)
+    guard = round(GUARD_S / T)
+    level = priors.accelerometer_bias / gravity
+    heading = hypot(
+        priors.gyro_bias / earth_rate_n(latitude_rad)[1],
+        tan(latitude_rad) * priors.accelerometer_bias / gravity,
+    )
+    rotation = Rotation(
+        before, before + n, before * T, (before + n) * T, None, None, planned.angle_deg, planned.up,
+        planned.up[1], 0.0, 0.0, 0, 0,
+    )  # fmt: skip
+    return Run(
+        f"plan#{k + 1}",
+        rotation,
+        Aligned(0, 0, q_nb, ALIGNMENT_S, level, heading, None),
+        gravity,
+        rows,
+        rows["v_n"],
+        (rows["counter"] + 1) * T,
+        rows["counter"] < before - guard,
+        rows["counter"] >= before + n + guard,
+    )

@@ -1,0 +1,116 @@
+"""Where the origin of b is put, and how other programs count the lever arms.
+
+Turned between rests, a unit shows how its three sensing points lie to each other, not where the origin lies.
+A gauge names the choice; a change of gauge is one common shift, and exact:
+
+    r_i' = r_i - (sum of w_j r_j)        w = (1, 1, 1) / 3 in `centroid`, (1, 0, 0) in `x`, ...
+
+`given` puts the origin where one point is stated to be, from a drawing; the statement bears no error here.
+The differences of the points, and what compensated data say at rest, are the same in every gauge.
+
+**Kalibr** (`--imu-models scale-misalignment-size-effect`) writes metres, axes of its frame i, x as origin:
+`accelerometers: {rx_i: [0, 0, 0], ry_i: [...], rz_i: [...]}`. Frame i is our b. Its model has the size effect
+before scale and misalignment M, ours on the sensing axes: they differ by misalignment times arm (1e-3 of it).
+
+**PSINS** keeps metres in `clbt.rx`, `clbt.ry`, `clbt.rz`, in the gauge that the motion had. As a calibration,
+`imuclbt(imu, clbt)` takes `S [rx; ry; rz]` off the specific force with the S of ours, and `sysclbt` finds it
+in that sense: the sign is ours. Where `imuclbt` is used to spoil perfect data with a struct, the unit so made
+has its points at minus that struct: its `clbt.rx` of (1, 2, 3) cm makes a unit with r_x = -(10, 20, 30) mm.
+
+>>> arms = Arms(np.array([[24, -11, -9], [-23, 29, -7], [-1, -18, 16]]) * 1e-3, None, "centroid")
+>>> to_kalibr(arms)["accelerometers"]["ry_i"]
+[-0.047, 0.04, 0.002]
+>>> to_psins(arms)["rx"]
+[0.024, -0.011, -0.009]
+"""
+
+from dataclasses import dataclass
+from typing import Final, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from imudrv.arrays import Array
+from imudrv.errors import InputError
+
+Gauge: TypeAlias = Literal["centroid", "x", "y", "z", "given"]
+
+
+GAUGES: Final[tuple[Gauge, ...]] = ("centroid", "x", "y", "z", "given")
+
+
+_WEIGHTS: Final = {
+    "centroid": (1 / 3, 1 / 3, 1 / 3),
+    "x": (1.0, 0.0, 0.0),
+    "y": (0.0, 1.0, 0.0),
+    "z": (0.0, 0.0, 1.0),
+}
+
+
+@dataclass(frozen=True)
+class Arms:
+    """The sensing points in a gauge.
+
+    Attributes
+    ----------
+    r_b : ndarray, shape (3, 3)
+        Row i: sensing point of accelerometer i, m, body axes.
+    covariance : ndarray, shape (9, 9), or None
+        Of (r_x, r_y, r_z) in the gauge, m^2; None: not known.
+    gauge : {'centroid', 'x', 'y', 'z', 'given'}
+        Where the origin of b is.
+    """
+
+    r_b: Array
+    covariance: Array | None
+    gauge: Gauge
+
+
+def convert(arms: Arms, to: Gauge, stated: tuple[Literal["x", "y", "z"], ArrayLike] | None = None) -> Arms:
+    """Go over to another gauge.
+
+    Parameters
+    ----------
+    arms : Arms
+        In any gauge.
+    to : {'centroid', 'x', 'y', 'z', 'given'}
+        The new one.
+    stated : tuple of an accelerometer and its sensing point, optional
+        For `given`: one of 'x', 'y', 'z' and where that one senses, m, body axes, shape (3,).
+
+    Returns
+    -------
+    Arms
+
+    Raises
+    ------
+    InputError
+        Not a gauge; `given` without a statement, or a statement without `given`; a point that is none.
+    """
+    if to not in GAUGES:
+        raise InputError(f"gauge: expected one of {', '.join(GAUGES)}, got {to!r}")
+    if to != "given":
+        if stated is not None:
+            raise InputError(
+                f"gauge {to}: expected no stated point, got one of accelerometer {stated[0]}; use gauge given"
+            )
+        return _shifted(arms, to, _WEIGHTS[to], np.zeros(3))
+    if stated is None:
+        raise InputError(
+            "gauge given: expected where one sensing point is, from a drawing, got none; the rotations alone "
+            "cannot tell it"
+        )
+    accelerometer, place = stated
+    point = np.asarray(place, np.float64)
+    if accelerometer not in ("x", "y", "z") or point.shape != (3,) or not np.isfinite(point).all():
+        raise InputError(
+            f"gauge given: expected x, y or z and three finite numbers, got {accelerometer!r} and {place!r}"
+        )
+    return _shifted(arms, to, _WEIGHTS[accelerometer], point)
+
+
+def _shifted(arms: Arms, gauge: Gauge, weights: tuple[float, float, float], origin: Array) -> Arms:
+    T = np.eye(9) - np.kron(np.tile(weights, (3, 1)), np.eye(3))
+    r_b = (T @ arms.r_b.ravel()).reshape(3, 3) + origin
+    covariance = None if arms.covariance is None else T @ arms.covariance @ T.T
+    return Arms(r_b, covariance, gauge)

@@ -1,0 +1,104 @@
+"""Lever arms in the formats of Kalibr and PSINS."""
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+
+from calib.lever_arms.gauge import Arms, convert
+from imudrv.arrays import Array
+from imudrv.errors import InputError
+
+_DIGITS: Final = 12
+"""Decimals of a metre that other programs' files get."""
+
+
+def to_kalibr(arms: Arms) -> dict[str, Any]:
+    """The arms as Kalibr's IMU file has them.
+
+    Parameters
+    ----------
+    arms : Arms
+        In any gauge.
+
+    Returns
+    -------
+    dict
+        `{"accelerometers": {"rx_i": ..., "ry_i": ..., "rz_i": ...}}`, lists of 3 float, m, x as origin.
+    """
+    r_b = convert(arms, "x").r_b
+    return {"accelerometers": {f"r{axis}_i": _list(r) for axis, r in zip("xyz", r_b, strict=True)}}
+
+
+def from_kalibr(document: Mapping[str, Any]) -> Arms:
+    """Read the arms of Kalibr's IMU file.
+
+    Parameters
+    ----------
+    document : mapping
+        Of one IMU: what stands below `imu0`.
+
+    Returns
+    -------
+    Arms
+        In gauge x, without covariance.
+
+    Raises
+    ------
+    InputError
+        There are no such arms in it.
+    """
+    section = document.get("accelerometers")
+    r_b = _points("Kalibr: accelerometers", section, [f"r{axis}_i" for axis in "xyz"])
+    return convert(Arms(r_b, None, "given"), "x")
+
+
+def to_psins(arms: Arms) -> dict[str, list[float]]:
+    """The arms as a PSINS calibration struct has them, for `imuclbt` to compensate with.
+
+    Parameters
+    ----------
+    arms : Arms
+        In any gauge, which is kept.
+
+    Returns
+    -------
+    dict
+        `rx`, `ry`, `rz`: lists of 3 float, m.
+    """
+    return {f"r{axis}": _list(r) for axis, r in zip("xyz", arms.r_b, strict=True)}
+
+
+def from_psins(clbt: Mapping[str, Any]) -> Arms:
+    """Read the arms of a PSINS calibration struct, as `sysclbt` finds it.
+
+    Parameters
+    ----------
+    clbt : mapping
+        With `rx`, `ry`, `rz`, m.
+
+    Returns
+    -------
+    Arms
+        In gauge given, for the struct does not name its origin; without covariance.
+
+    Raises
+    ------
+    InputError
+        There are no such arms in it.
+    """
+    return Arms(_points("PSINS: clbt", clbt, ["rx", "ry", "rz"]), None, "given")
+
+
+def _list(r: Array) -> list[float]:
+    return [round(float(value), _DIGITS) for value in r]
+
+
+def _points(where: str, section: Any, names: list[str]) -> Array:
+    try:
+        r_b = np.array([np.ravel(section[name]) for name in names], np.float64)
+    except (KeyError, TypeError, ValueError):
+        r_b = np.empty(0)
+    if r_b.shape != (3, 3) or not np.isfinite(r_b).all():
+        raise InputError(f"{where}: expected {', '.join(names)} as three numbers each, m, got {section!r}")
+    return r_b

@@ -1,0 +1,136 @@
+"""Plan of a procedure: the shipped ones, predicted accuracy, remaining steps."""
+
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+from importlib import resources
+from pathlib import Path
+from typing import Final
+
+from calib.axes import opposite
+from calib.detection.noise import Noise
+from calib.estimation.predict import Planned, Prediction, predict
+from calib.estimation.runs import Priors
+from calib.procedure.schema import VERIFICATION, Pose, Procedure, Step
+from imudrv.errors import InputError
+from imudrv.files.settings_file import SettingsFile, read_file
+from imudrv.site import Site
+from imudrv.units import DEG_PER_SQRT_H
+
+TURN_S: Final = 2.5
+"""A rotation by hand from rest to rest, as predictions take it, s."""
+
+
+TYPICAL_NOISE: Final = Noise(
+    angle_walk=0.002 * DEG_PER_SQRT_H, velocity_walk=8e-5, velocity_white=6e-5, velocity_pulse=1.2e-4
+)
+"""Of a unit of the kind that was not measured yet; how its pulses beat makes it quieter in some poses."""
+
+
+def predicted(
+    procedure: Procedure,
+    site: Site,
+    noise: Noise | None = None,
+    priors: Priors | None = None,
+    skipped: Collection[str] = (),
+) -> Prediction:
+    """Tell what a procedure will give.
+
+    Parameters
+    ----------
+    procedure : Procedure
+        The plan.
+    site : Site
+        Where the unit stands.
+    noise : Noise, optional
+        Of the unit's sensors; `TYPICAL_NOISE` where it was not measured yet.
+    priors : Priors, optional
+        What the static calibration leaves.
+    skipped : collection of str
+        Ids of steps that are left out.
+
+    Returns
+    -------
+    Prediction
+        `differences_sigma` are the 1-sigma of the six differences, m.
+
+    Raises
+    ------
+    InputError
+        The rotations do not see the six differences; names the directions.
+    """
+    plan = [
+        Planned(step.up, step.turn_deg, TURN_S, step.rest_s)
+        for step in procedure.steps
+        if step.id not in skipped
+    ]
+    try:
+        return predict(plan, site.latitude_rad, noise or TYPICAL_NOISE, priors)
+    except InputError as error:
+        raise InputError(f"procedure {procedure.name}: {error}") from error
+
+
+def steps_left(procedure: Procedure, done: Collection[str]) -> Procedure:
+    """The procedure of the steps that are not done.
+
+    Parameters
+    ----------
+    procedure : Procedure
+        The whole one.
+    done : collection of str
+        Ids of steps; not all of them.
+
+    Returns
+    -------
+    Procedure
+    """
+    return _with_steps(procedure, [step for step in procedure.steps if step.id not in done])
+
+
+def verification(procedure: Procedure) -> Procedure:
+    """One more rotation, `VERIFICATION`, from where the last one ended."""
+    last = procedure.steps[-1]
+    return _with_steps(procedure, [replace(last, id=VERIFICATION, east=opposite(last.east))])
+
+
+def _with_steps(procedure: Procedure, steps: Sequence[Step]) -> Procedure:
+    poses = tuple(Pose.model_validate(vars(step)) for step in steps)
+    return procedure.model_copy(update={"poses": poses})
+
+
+def shipped() -> list[str]:
+    """Names of the procedures that come with the package."""
+    return sorted(p.name.removesuffix(".yaml") for p in (resources.files("calib") / "procedures").iterdir())
+
+
+def load(name_or_path: str) -> Procedure:
+    """Load a procedure, by the name of a shipped one or by the path of a file.
+
+    Parameters
+    ----------
+    name_or_path : str
+        ``three-rotations``, or ``my/bench.yaml``.
+
+    Returns
+    -------
+    Procedure
+        Checked.
+
+    Raises
+    ------
+    InputError
+        No such procedure, or one with faults; all faults at once.
+    """
+    return load_file(name_or_path).model
+
+
+def load_file(name_or_path: str) -> SettingsFile[Procedure]:
+    """Load a procedure with the content of its file; see `load`."""
+    if name_or_path in shipped():
+        with resources.as_file(resources.files("calib") / "procedures" / f"{name_or_path}.yaml") as path:
+            return read_file(path, Procedure)
+    if not Path(name_or_path).exists():
+        raise InputError(
+            f"procedure {name_or_path!r}: expected one of {', '.join(shipped())}, "
+            "or the path of a procedure file; there is no such file"
+        )
+    return read_file(name_or_path, Procedure)

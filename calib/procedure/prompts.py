@@ -1,0 +1,198 @@
+"""The words of the bench procedure: what to do now, which way, what is expected, from what sensors show."""
+
+from dataclasses import dataclass
+from math import pi
+from typing import Final, TypeAlias
+
+from calib.axes import axis_name, opposite, side, vector
+from calib.detection.tracking import Posture, Stillness, Turn
+from calib.procedure.schema import Limits, Step
+from imudrv.records import Flag
+from imudrv.units import DEG
+
+Says: TypeAlias = tuple[str, tuple[str, ...]]
+"""A headline of at most 38 characters, and hints."""
+
+
+READY_S: Final = 1.0
+"""The unit has been set down when it stands still for so long, s."""
+
+
+NAMED_RAD: Final = 10.0 * DEG
+"""A turn of less has no way and no axis yet."""
+
+
+_AHEAD_S: Final = 0.3  # a person stops so long after the word
+
+
+_LONG_S: Final = 5.0  # so long in the wrong pose is no passing moment
+
+
+_COMPASS: Final = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")
+
+
+def way(clockwise_rad: float) -> str:
+    """Say the turn that takes back one of so much clockwise: ``90 deg clockwise, seen from above``."""
+    turn = "counter-clockwise" if clockwise_rad > 0.0 else "clockwise"
+    return f"{abs(clockwise_rad) / DEG:.0f} deg {turn}, seen from above"
+
+
+def way_round(step: Step) -> str:
+    """Say a pose."""
+    north = axis_name(step.C_bn[:, 1])
+    return f"{side(step.up)} up, {side(step.east)} about east, {side(north)} about north"
+
+
+def wrong_way(angle_rad: float, step: Step) -> str:
+    """Say that a turn has the wrong sign."""
+    return f"turns the wrong way: {angle_rad / DEG:+.0f} deg, want {step.turn_deg:+d}"
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What the sensors show, and what the step wants.
+
+    Attributes
+    ----------
+    step : Step
+        The current one.
+    limits : Limits
+        Of the procedure.
+    posture : Posture
+        How the unit lies.
+    still : Stillness
+        Whether it stands still.
+    flags : int
+        `Flag` bits of the newest block.
+    faults : tuple of str
+        Names of the faults that the unit tells.
+    """
+
+    step: Step
+    limits: Limits
+    posture: Posture
+    still: Stillness
+    flags: int
+    faults: tuple[str, ...]
+
+    @property
+    def upright(self) -> bool:
+        """Whether the right side is up."""
+        return self.posture.lean(vector(self.step.up)) <= self.limits.tilt_deg * DEG
+
+    @property
+    def clockwise(self) -> float | None:
+        """How far the pose is turned clockwise, rad, -pi to pi; None: not known."""
+        azimuth = self.posture.azimuth(vector(self.step.east))
+        return None if azimuth is None else (azimuth + 0.5 * pi) % (2.0 * pi) - pi
+
+    @property
+    def placed(self) -> bool:
+        """Whether the unit lies as the step wants it, as far as it is known."""
+        return self.upright and abs(self.clockwise or 0.0) <= self.limits.heading_deg * DEG
+
+    @property
+    def unfit(self) -> str:
+        """Why the unit cannot measure, if it cannot."""
+        if self.flags & Flag.FAULT:
+            names = f": {', '.join(self.faults)}" if self.faults else ""
+            return f"the unit tells a fault{names}"
+        return "the unit is warming up" if self.flags & Flag.WARM_UP else ""
+
+    @property
+    def ready(self) -> bool:
+        """Whether the sensors agree that the unit stands as the step wants it."""
+        return self.placed and self.still.quiet_s >= READY_S and not self.unfit
+
+
+def preflight(seen: Seen, failed: bool) -> Says:
+    """For the preflight; `failed`: the last check found something."""
+    if seen.flags & Flag.WARM_UP:
+        return "WARMING UP, WAIT", ("the unit's warm-up bit is set",)
+    if seen.still.moving or not (seen.upright or failed):
+        return f"SET IT DOWN: {side(seen.step.up)} UP", (way_round(seen.step), *_motion(seen))
+    if failed:
+        return "CHECK FAILED: SEE WHY", (
+            way_round(seen.step),
+            "it is checked again and again, and goes on when all is well",
+        )
+    return "HANDS OFF, CHECKING", (way_round(seen.step),)
+
+
+def place(seen: Seen, hands_free: bool) -> Says:
+    """For placing the unit; `hands_free`: nobody is asked to confirm."""
+    step = seen.step
+    if not seen.upright:
+        return f"TURN IT: {side(step.up)} UP", (*_tip(seen), way_round(step))
+    if not seen.placed:
+        clockwise = seen.clockwise or 0.0
+        word = "COUNTER-CLOCKWISE" if clockwise > 0.0 else "CLOCKWISE"
+        hint = (
+            f"{side(step.east)} points {abs(clockwise) / DEG:.0f} deg off east, want "
+            f"{seen.limits.heading_deg:g} at most: turn it {way(clockwise)}"
+        )
+        return f"TURN IT {abs(clockwise) / DEG:.0f} DEG {word}", (hint, way_round(step))
+    if seen.unfit:
+        return "WAIT FOR THE UNIT", (seen.unfit,)
+    if seen.still.quiet_s < READY_S:
+        return "SET IT DOWN, HANDS OFF", (way_round(step), *_motion(seen))
+    return "HANDS OFF" if hands_free else "READY: CONFIRM", (way_round(step),)
+
+
+def settle(seen: Seen) -> Says:
+    """For standing still before the alignment."""
+    if seen.unfit:
+        return "WAIT FOR THE UNIT", (seen.unfit,)
+    return "HANDS OFF, SETTLING", _motion(seen)
+
+
+def rotate(seen: Seen, turn: Turn) -> Says:
+    """For the turn."""
+    step, limits = seen.step, seen.limits
+    whole = abs(step.turn_deg) * DEG
+    how = "counter-clockwise" if step.turn_deg > 0 else "clockwise"
+    plain = (f"{abs(step.turn_deg)} deg {how}, seen from above, in 2 to 3 s; then hands off",)
+    if turn.begun is None:
+        return f"ROTATE NOW {step.turn_deg:+d}", plain
+    if turn.size > NAMED_RAD:
+        if turn.axis_tilt > limits.axis_tilt_deg * DEG:
+            return "WRONG AXIS", (
+                f"turns about {turn.about}, {turn.axis_tilt / DEG:.0f} deg off the vertical, want "
+                f"{limits.axis_tilt_deg:g} at most: keep {side(step.up)} up",
+            )
+        if turn.angle * step.turn_deg < 0.0:
+            return "WRONG WAY", (wrong_way(turn.angle, step),)
+    done = abs(turn.angle)
+    if done + abs(turn.rate) * _AHEAD_S >= whole:
+        return "STOP", (f"stop at {abs(step.turn_deg)} deg, hands off",)
+    if done >= whole - limits.angle_tolerance_deg * DEG:
+        return "HOLD STILL", (f"turned {turn.angle / DEG:+.0f} deg",)
+    # a smooth turn is nearly at its fastest from a quarter of the way on
+    if 0.25 < done / whole < 0.7 and turn.peak < 0.9 * limits.least_peak_deg_per_s * DEG:
+        return "FASTER", (f"peak {turn.peak / DEG:.0f} deg/s, want {limits.least_peak_deg_per_s:g} at least",)
+    return f"ROTATE {step.turn_deg:+d}", plain
+
+
+def _tip(seen: Seen) -> tuple[str, ...]:
+    """Which way to tip the unit so that the right side comes up."""
+    want, now, posture = seen.step.up, seen.posture.up, seen.posture
+    if now == want:
+        lean = posture.lean(vector(want)) / DEG
+        return (f"the {side(now)} side leans {lean:.0f} deg, want {seen.limits.tilt_deg:g} at most",)
+    task = f"the {side(now)} side is up, turn the {side(want)} side up"
+    if now[1] == want[1]:
+        hint, cause = f"{task}: turn it over, 180 deg", f"accelerometer {want[1]} is reversed"
+    else:
+        # the upper side tips to where the one opposite to the wanted one looks
+        down = opposite(want)
+        azimuth = posture.azimuth(vector(down))
+        compass = "" if azimuth is None else f" ({_COMPASS[round(azimuth / (pi / 4.0)) % 8]})"
+        hint = f"{task}: roll it 90 deg toward its {side(down)} side{compass}"
+        cause = f"accelerometers {now[1]} and {want[1]} are exchanged"
+    if seen.still.quiet_s < _LONG_S:
+        return (hint,)
+    return hint, f"if its {side(want)} side is up, {cause}: check the certificate"
+
+
+def _motion(seen: Seen) -> tuple[str, ...]:
+    return (f"it moves: {seen.still.why}",) if seen.still.moving else ()

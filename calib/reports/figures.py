@@ -1,0 +1,251 @@
+"""Figures of the report, as SVG: the same input gives the same bytes."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from io import BytesIO
+from typing import Any, Final
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from calib.estimation.result import RunResult
+from calib.estimation.runs import Run
+from imudrv.arrays import Array
+from imudrv.units import MM
+
+WIDTH_IN: Final = 7.0
+
+
+POINTS: Final = 2000
+"""So many points of a curve are drawn at the least."""
+
+
+_COLOURS: Final = ("#1f5fa8", "#b8561a", "#3b7a4b")
+
+
+_GREY: Final = "#8a8f98"
+
+
+_STYLE: Final[dict[Any, Any]] = {
+    "svg.hashsalt": "imu50",
+    "font.size": 8,
+    "axes.titlesize": 8,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": _GREY,
+    "axes.linewidth": 0.6,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e3e5e8",
+    "grid.linewidth": 0.6,
+    "xtick.color": "#44484f",
+    "ytick.color": "#44484f",
+    "lines.linewidth": 1.0,
+    "legend.frameon": False,
+}
+
+
+class _Canvas:
+    """A figure on its way to SVG."""
+
+    def __init__(self, height_in: float) -> None:
+        self.figure = Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
+        self.svg = b""
+
+
+@contextmanager
+def _canvas(height_in: float) -> Iterator[_Canvas]:
+    with mpl.rc_context(_STYLE):
+        canvas = _Canvas(height_in)
+        yield canvas
+        out = BytesIO()
+        canvas.figure.savefig(out, format="svg", metadata={"Date": None})
+        canvas.svg = out.getvalue()
+
+
+def sensing_points(r_b: Array, C_ba: Array) -> bytes:
+    """Draw where the accelerometers sense, and along which axes, in three views.
+
+    Parameters
+    ----------
+    r_b : ndarray, shape (3, 3)
+        Row i: sensing point of accelerometer i, m, body axes.
+    C_ba : ndarray, shape (3, 3)
+        Accelerometer axes to body; the sensing directions are the rows of its inverse.
+
+    Returns
+    -------
+    bytes
+        SVG.
+    """
+    points, directions = r_b / MM, np.linalg.inv(C_ba)
+    arrows = 0.3 * (float(np.ptp(points, axis=0).max()) or 1.0) * directions
+    shown = np.concatenate([points, points + arrows, np.zeros((1, 3))])
+    middle = (shown.min(axis=0) + shown.max(axis=0)) / 2.0
+    half = 0.6 * float(np.ptp(shown, axis=0).max())
+    with _canvas(2.7) as canvas:
+        # what lies to the right and up on the paper, and what points at the one who looks
+        views = (
+            ("from above", 0, 1, [0, 0, 1]),
+            ("from behind", 0, 2, [0, -1, 0]),
+            ("from the right", 1, 2, [1, 0, 0]),
+        )
+        for axes, (title, h, v, viewer) in zip(canvas.figure.subplots(1, 3), views, strict=True):
+            axes.set_title(title)
+            axes.plot(0.0, 0.0, "+", color=_GREY, markersize=9)
+            for name, point, arrow, colour in zip("xyz", points, arrows, _COLOURS, strict=True):
+                axes.plot(point[h], point[v], "o", color=colour, markersize=5)
+                if np.hypot(arrow[h], arrow[v]) > 0.5 * np.linalg.norm(arrow):
+                    tip = (point[h] + arrow[h], point[v] + arrow[v])
+                    axes.annotate(
+                        "", tip, (point[h], point[v]), arrowprops={"arrowstyle": "->", "color": colour}
+                    )
+                else:
+                    axes.plot(point[h], point[v], "o", color=colour, markersize=11, fillstyle="none")
+                    if arrow @ viewer < 0.0:
+                        axes.plot(point[h], point[v], "x", color=colour, markersize=8)
+                axes.annotate(
+                    name,
+                    (point[h], point[v]),
+                    (-7, -10),
+                    textcoords="offset points",
+                    color=colour,
+                    weight="bold",
+                )
+            axes.set(
+                xlim=(middle[h] - half, middle[h] + half),
+                ylim=(middle[v] - half, middle[v] + half),
+                xlabel=f"{'XYZ'[h]} (mm)",
+                ylabel=f"{'XYZ'[v]} (mm)",
+                aspect="equal",
+            )
+    return canvas.svg
+
+
+def velocities(run: Run, told: RunResult) -> bytes:
+    """Velocity of a run at rest with what the estimate says of it, and what is left.
+
+    Parameters
+    ----------
+    run : Run
+        For the time of the rotation.
+    told : RunResult
+        Of that run.
+
+    Returns
+    -------
+    bytes
+        SVG.
+    """
+    turned = (float(run.t_s[run.before][-1]), float(run.t_s[run.after][0]))
+    before = told.t_s < turned[0]
+    with _canvas(2.2) as canvas:
+        left, right = canvas.figure.subplots(1, 2)
+        for k, name in enumerate(("east", "north")):
+            v, fitted = told.v_n[:, k] / MM, told.fitted_n[:, k] / MM
+            left.plot(told.t_s, v, ".", color=_COLOURS[k], markersize=3, label=name)
+            for part in (before, ~before):
+                left.plot(told.t_s[part], fitted[part], color=_COLOURS[k], alpha=0.6)
+            right.plot(told.t_s, v - fitted, ".", color=_COLOURS[k], markersize=3)
+        left.set(title="velocity at rest (points), estimate (lines)", ylabel="mm/s")
+        right.set(title="what the estimate leaves", ylabel="mm/s")
+        for axes in (left, right):
+            axes.axvspan(*turned, color="#eef0f3", linewidth=0)
+            axes.set_xlabel("time from the start of navigation (s)")
+        left.legend(loc="best", fontsize=7)
+    return canvas.svg
+
+
+def before_after(told: Sequence[RunResult]) -> bytes:
+    """Horizontal velocity after each rotation, as it came and without the size effect.
+
+    Parameters
+    ----------
+    told : sequence of RunResult
+        The rotations, called by their numbers.
+
+    Returns
+    -------
+    bytes
+        SVG.
+    """
+    with _canvas(0.7 + 0.32 * len(told)) as canvas:
+        axes: Axes = canvas.figure.subplots()
+        at = np.arange(len(told))
+        for k, (name, values) in enumerate(
+            (
+                ("as measured", [run.V_n for run in told]),
+                ("without the size effect", [run.compensated_n for run in told]),
+            )
+        ):
+            speed = [np.hypot(v[0], v[1]) / MM for v in values]
+            bars = axes.barh(at + 0.2 * (2 * k - 1), speed, 0.34, color=(_GREY, _COLOURS[0])[k], label=name)
+            axes.bar_label(bars, fmt="%.1f", padding=3, fontsize=7)
+        axes.set(xlabel="horizontal velocity after the rotation (mm/s)")
+        axes.set_yticks(at, [f"run {k + 1}" for k in at])
+        axes.invert_yaxis()
+        axes.grid(visible=False, axis="y")
+        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7)
+    return canvas.svg
+
+
+def courses(t_s: Array, normal_n: Array, compensated_n: Array, moved_s: tuple[float, float] | None) -> bytes:
+    """Velocity error over time of a navigation without and one with the size effect compensated.
+
+    Parameters
+    ----------
+    t_s : ndarray, shape (n,)
+        Time.
+    normal_n, compensated_n : ndarray, shape (n, 3)
+        Velocities east, north and up, m/s.
+    moved_s : tuple of 2 float, or None
+        The motion.
+
+    Returns
+    -------
+    bytes
+        SVG.
+    """
+    step = max(1, len(t_s) // POINTS)
+    with _canvas(4.2) as canvas:
+        panels = canvas.figure.subplots(3, 1, sharex=True)
+        for k, (axes, name) in enumerate(zip(panels, ("east", "north", "up"), strict=True)):
+            if moved_s is not None:
+                axes.axvspan(*moved_s, color="#eef0f3", linewidth=0)
+            axes.plot(t_s[::step], normal_n[::step, k], color=_COLOURS[1], label="Normal")
+            axes.plot(t_s[::step], compensated_n[::step, k], color=_COLOURS[0], label="Compensation")
+            axes.set_ylabel(f"{name} (m/s)")
+        panels[0].legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, fontsize=7)
+        panels[-1].set_xlabel("time from the end of the alignment (s)")
+    return canvas.svg
+
+
+def directions(sigma: Array, rank: int, limit_m: float) -> bytes:
+    """How well each principal direction of the nine components is seen.
+
+    Parameters
+    ----------
+    sigma : ndarray, shape (9,)
+        1-sigma of each, m, best first.
+    rank : int
+        How many are seen.
+    limit_m : float
+        Worse than this is not seen, m.
+
+    Returns
+    -------
+    bytes
+        SVG.
+    """
+    with _canvas(1.9) as canvas:
+        axes: Axes = canvas.figure.subplots()
+        at = np.arange(1, len(sigma) + 1)
+        axes.axhline(limit_m / MM, color=_COLOURS[1], linestyle="--", label="limit")
+        axes.semilogy(at[:rank], sigma[:rank] / MM, "o", color=_COLOURS[0], label="seen")
+        axes.semilogy(at[rank:], sigma[rank:] / MM, "o", color=_GREY, fillstyle="none", label="not seen")
+        axes.set(xlabel="principal direction of (r_x, r_y, r_z)", ylabel="sigma (mm)")
+        axes.set_xticks(at)
+        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7)
+    return canvas.svg

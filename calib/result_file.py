@@ -1,0 +1,197 @@
+"""JSON document of an identification."""
+
+import json
+from dataclasses import asdict
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Final
+
+from calib.estimation.result import Identification
+from calib.estimation.runs import Priors, Run
+from calib.identification import Findings, Source, scatter
+from calib.lever_arms.gauge import Arms
+from imudrv.arrays import Array
+from imudrv.files.atomic import replacing
+from imudrv.units import ARCSEC, DEG, DEG_PER_H, MM, PPM, STANDARD_GRAVITY, UG, URAD
+
+FORMAT: Final = "imu50-identification"
+
+
+VERSION: Final = 1
+
+
+def result_document(findings: Findings, arms: Arms) -> dict[str, Any]:
+    """Put the whole result into plain data, units in the names.
+
+    Parameters
+    ----------
+    findings : Findings
+        What was found.
+    arms : Arms
+        The lever arms in the gauge that is wanted.
+
+    Returns
+    -------
+    dict
+        For JSON.
+    """
+    result = findings.result
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "created": _time(findings.created),
+        "software": findings.software,
+        "serial_number": findings.basis.calibration.serial_number,
+        "method": result.method,
+        **inputs_document(findings),
+        "gauge": arms.gauge,
+        "r_mm": _by_axis(arms.r_b / MM),
+        "covariance_mm2": None if arms.covariance is None else (arms.covariance / MM**2).tolist(),
+        **outcome_document(result),
+        "differences_covariance_mm2": (result.differences_covariance / MM**2).tolist(),
+        "reason": result.reason,
+        "notes": list(result.notes),
+        "noise": {
+            "angle_walk_rad_per_sqrt_s": result.noise.angle_walk,
+            "velocity_walk_m_s_per_sqrt_s": result.noise.velocity_walk,
+            "velocity_white_m_s": result.noise.velocity_white,
+            "velocity_pulse_m_s": result.noise.velocity_pulse,
+        },
+        "nuisances_si": [
+            {"name": n.name, "value": n.value, "sigma": n.sigma, "prior_sigma": n.prior, "seen": n.seen}
+            for n in result.nuisances
+        ],
+        "correlation_of_r_with_nuisances": result.correlation.tolist(),
+        "correlation_of_differences_with_nuisances": findings.differences_correlation.tolist(),
+        "left_out": [
+            {
+                "run": one.label,
+                "rank": one.rank,
+                "shift_mm": None if one.shift_m is None else (one.shift_m / MM).tolist(),
+            }
+            for one in result.left_out
+        ],
+        "runs": [
+            {
+                **_profile(run),
+                "V_n_m_s": told.V_n.tolist(),
+                "H_n_m_s_per_m": told.H.tolist(),
+                "V_n_minus_H_R_m_s": told.compensated_n.tolist(),
+                "H_rest_m_s_per_m": told.H_rest,
+                "t_s": told.t_s.tolist(),
+                "v_n_m_s": told.v_n.tolist(),
+                "fitted_n_m_s": told.fitted_n.tolist(),
+            }
+            for run, told in zip(findings.runs, result.runs, strict=True)
+        ],
+    }
+
+
+def write_json(path: Path, document: dict[str, Any]) -> None:
+    """Write plain data as JSON; the file appears whole.
+
+    Parameters
+    ----------
+    path : Path
+        Where.
+    document : dict
+        What `result_document` gives.
+
+    Raises
+    ------
+    InputError
+        It cannot be written.
+    """
+    with replacing(path) as file:
+        file.write(json.dumps(document, indent=1, allow_nan=False).encode() + b"\n")
+
+
+def inputs_document(findings: Findings) -> dict[str, Any]:
+    """What the findings rest on."""
+    basis = findings.basis
+    return {
+        "calibration": {"name": basis.name, "sha256": basis.sha256},
+        "site": findings.site.model_dump(exclude={"format", "version"}, exclude_none=True),
+        "captures": [_capture(source) for source in findings.sources],
+        "limits": asdict(findings.limits),
+        "priors": _priors(findings.priors),
+    }
+
+
+def _capture(source: Source) -> dict[str, Any]:
+    evidence = source.evidence
+    return {
+        "name": source.name,
+        "sha256": source.sha256,
+        "profile": source.profile,
+        **({} if source.channel is None else {"channel": source.channel}),
+        "duration_s": evidence.segments.duration_s,
+        "samples": source.books,
+        "temperature_degc": {t.channel: [t.least_degc, t.most_degc] for t in source.temperatures},
+        "runs": [run.label for run in evidence.runs],
+        "rejected": [
+            {"start_s": rotation.start_s, "stop_s": rotation.stop_s, "reasons": list(reasons)}
+            for rotation, reasons in evidence.rejected
+        ],
+    }
+
+
+def _priors(priors: Priors) -> dict[str, float]:
+    return {
+        "accelerometer_bias_ug": priors.accelerometer_bias / UG,
+        "accelerometer_scale_ppm": priors.accelerometer_scale / PPM,
+        "accelerometer_misalignment_urad": priors.accelerometer_misalignment / URAD,
+        "gyro_bias_deg_per_h": priors.gyro_bias / DEG_PER_H,
+        "gyro_scale_ppm": priors.gyro_scale / PPM,
+        "gyro_misalignment_urad": priors.gyro_misalignment / URAD,
+        "skew_s": priors.skew,
+        "quadratic_ug_per_g2": priors.quadratic * STANDARD_GRAVITY**2 / UG,
+        "arm_mm": priors.arm / MM,
+    }
+
+
+def outcome_document(result: Identification) -> dict[str, Any]:
+    """The figures that a reader of the certificate asks for first."""
+    names = ("x_minus_y", "x_minus_z")
+    return {
+        "differences_mm": dict(zip(names, (result.differences / MM).tolist(), strict=True)),
+        "differences_sigma_mm": dict(zip(names, (result.differences_sigma / MM).tolist(), strict=True)),
+        "rank": result.rank,
+        "direction_sigma_mm": (result.direction_sigma / MM).tolist(),
+        "singular_values_m_s_per_m": result.singular_values.tolist(),
+        "chi_square": result.chi_square,
+        "degrees_of_freedom": result.degrees_of_freedom,
+        "residual_scatter_mm_s": {run.label: scatter(run) / MM for run in result.runs},
+    }
+
+
+def _profile(run: Run) -> dict[str, Any]:
+    """How a rotation went."""
+    rotation, aligned = run.rotation, run.aligned
+    return {
+        "run": run.label,
+        "up": rotation.axis,
+        "start_s": rotation.start_s,
+        "stop_s": rotation.stop_s,
+        "angle_deg": rotation.angle_deg,
+        "peak_deg_per_s": rotation.peak_deg_per_s,
+        "axis_tilt_deg": rotation.axis_tilt_deg,
+        "missing_samples": rotation.missing,
+        "rest_before_s": None if rotation.before is None else rotation.before.duration_s,
+        "rest_after_s": None if rotation.after is None else rotation.after.duration_s,
+        "alignment": {
+            "duration_s": aligned.duration_s,
+            "heading_deg": aligned.heading_rad / DEG,
+            "heading_sigma_deg": aligned.heading_sigma_rad / DEG,
+            "level_sigma_arcsec": aligned.level_sigma_rad / ARCSEC,
+            "motion": aligned.motion,
+        },
+    }
+
+
+def _by_axis(rows: Array) -> dict[str, Any]:
+    return dict(zip("xyz", rows.tolist(), strict=True))
+
+
+def _time(time: datetime) -> str:
+    return time.isoformat().replace("+00:00", "Z")

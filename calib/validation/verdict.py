@@ -1,0 +1,113 @@
+"""Metrics and verdict of a trial."""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from calib.detection.noise import Noise
+from calib.validation.trial import FIRST_S, Expected, Trial
+from imudrv.arrays import Array
+from imudrv.nav.earth import SEMI_MAJOR_AXIS
+
+SMALLER: Final = 0.95
+"""By so much compensation has to make the velocity after a fast motion smaller."""
+
+
+SAME: Final = 0.05
+"""So much of the velocity it may change where nothing turns fast."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A trial in figures; m/s, horizontal where it is not said otherwise.
+
+    Attributes
+    ----------
+    expected : {'smaller', 'same'}
+        What compensation should do.
+    before : tuple of 2 float
+        rms in the rest before the motion, without and with; NaN where there is none.
+    first : tuple of 3 float
+        Speed of the mean velocity over the first second after the motion: without, with, and of the twin.
+        The twin's is NaN where there is none.
+    first_n : ndarray, shape (2, 3)
+        That mean velocity, without and with: east, north, up.
+    whole : tuple of 3 float
+        rms over the rest after the motion: without, with, and of the twin.
+    effect : tuple of 2 float
+        rms of the difference from the twin over that rest, without and with.
+    change : float
+        rms of the difference between with and without.
+    noise : float
+        What the sensors' noise makes of velocity meanwhile, rms.
+    """
+
+    expected: Expected
+    before: tuple[float, float]
+    first: tuple[float, float, float]
+    first_n: Array
+    whole: tuple[float, float, float]
+    effect: tuple[float, float]
+    change: float
+    noise: float
+
+    @property
+    def smaller_by(self) -> float:
+        """By how much compensation makes the velocity right after the motion smaller; 1: all of it."""
+        return 1.0 - self.first[1] / self.first[0]
+
+    @property
+    def good(self) -> bool:
+        """Whether compensation does what it should."""
+        if self.expected == "smaller":
+            return self.smaller_by >= SMALLER
+        return self.change < min(SAME * self.whole[0], self.noise)
+
+
+def judge(trial: Trial) -> Judged:
+    """Put a trial into figures.
+
+    Parameters
+    ----------
+    trial : Trial
+        As navigated.
+
+    Returns
+    -------
+    Judged
+    """
+    after, before = trial.after, trial.before
+    first = after & (trial.t_s < trial.t_s[after][0] + FIRST_S)
+    v = trial.normal.v_n, trial.compensated.v_n
+    floor_v = np.full_like(v[0], np.nan) if trial.twin is None else trial.twin.v_n
+    mean = [one[first].mean(axis=0) for one in (*v, floor_v)]
+    noise = noise_velocity(trial.t_s[after], trial.noise, trial.gravity)
+    return Judged(
+        trial.expected,
+        before=(_rms(v[0][before]), _rms(v[1][before])) if before.any() else (np.nan, np.nan),
+        first=(_speed(mean[0]), _speed(mean[1]), _speed(mean[2])),
+        first_n=np.array(mean[:2]),
+        whole=(_rms(v[0][after]), _rms(v[1][after]), _rms(floor_v[after])),
+        effect=(_rms((v[0] - floor_v)[after]), _rms((v[1] - floor_v)[after])),
+        change=_rms((v[1] - v[0])[after]),
+        noise=float(np.sqrt(2.0 * (noise**2).mean())),
+    )
+
+
+def noise_velocity(t_s: Array, noise: Noise, gravity: float) -> Array:
+    """Velocity of an axis that noise makes in the time t, 1 sigma, m/s; see the module's text."""
+    W = (gravity / SEMI_MAJOR_AXIS) ** 0.5
+    even, odd = 0.5 * t_s, np.sin(2.0 * W * t_s) / (4.0 * W)
+    of_velocity, of_tilt = noise.velocity_walk, noise.angle_walk * gravity / W
+    sigma: Array = np.sqrt(of_velocity**2 * (even + odd) + of_tilt**2 * (even - odd))
+    return sigma
+
+
+def _speed(v_n: Array) -> float:
+    return float(np.hypot(v_n[0], v_n[1]))
+
+
+def _rms(v_n: Array) -> float:
+    """Of the horizontal speed."""
+    return float(np.sqrt((v_n[:, :2] ** 2).sum(axis=1).mean()))

@@ -1,0 +1,210 @@
+"""The device of a port: whether it exists, may be opened, and who else has it."""
+
+import grp
+import os
+import resource
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from imudrv.doctor.verdict import Step, Verdict
+from imudrv.service.runtime import PRIORITY
+
+RULES: Final = "tools/99-imu50.rules"
+
+
+_LOW_LATENCY: Final = 1 << 13  # ASYNC_LOW_LATENCY, linux/tty_flags.h
+
+
+_IFF_UP: Final = 1
+
+
+@dataclass(frozen=True)
+class System:
+    """Where the system tells about itself.
+
+    Parameters
+    ----------
+    sys, proc, dev : Path
+        Usually /sys, /proc and /dev.
+    """
+
+    sys: Path = Path("/sys")
+    proc: Path = Path("/proc")
+    dev: Path = Path("/dev")
+
+
+def limits() -> Iterator[Step]:
+    """Whether a real-time place and locked memory would be granted to this user."""
+    for name, limit, enough, key, unit in (
+        ("real-time priority", resource.RLIMIT_RTPRIO, PRIORITY, "rtprio 50", "LimitRTPRIO=50"),
+        ("locked memory", resource.RLIMIT_MEMLOCK, None, "memlock unlimited", "LimitMEMLOCK=infinity"),
+    ):
+        soft, _ = resource.getrlimit(limit)
+        unlimited = soft == resource.RLIM_INFINITY
+        if os.geteuid() == 0 or unlimited or (enough is not None and soft >= enough):
+            yield Step(name, Verdict.OK, "--realtime would get it")
+        else:
+            yield Step(
+                name,
+                Verdict.WARN,
+                f"the limit is {soft}: --realtime would be refused; only a loaded machine needs it",
+                f"put the line '{_user()} - {key}' into /etc/security/limits.d/imu50.conf and log in again, "
+                f"or {unit} into the systemd unit",
+            )
+
+
+def _user() -> str:
+    return os.environ.get("USER", "YOUR_NAME")
+
+
+def device_steps(device: Path, system: System) -> Iterator[Step]:
+    """Examine the device of a serial port."""
+    if not device.exists():
+        there = [str(path) for path in candidates(system)]
+        yield Step(
+            "device",
+            Verdict.FAIL,
+            f"there is no {device}",
+            f"take one of {', '.join(there)}"
+            if there
+            else "plug the unit's adapter in; there is no serial port here at all",
+        )
+        return
+    target = device.resolve()
+    yield Step("device", Verdict.OK, str(device) if target == device else f"{device} is {target}")
+    if os.access(device, os.R_OK | os.W_OK):
+        yield Step("permission", Verdict.OK, "this user may open it")
+    else:
+        group = _group(device)
+        yield Step(
+            "permission",
+            Verdict.FAIL,
+            f"this user may not open {device}; the group {group} may",
+            f"sudo usermod -aG {group} {_user()}, then log in again; or install the udev rule {RULES}",
+        )
+        return
+    there_are, all_seen = holders(target, system)
+    if there_are:
+        yield Step(
+            "busy",
+            Verdict.FAIL,
+            f"open in {', '.join(there_are)}: each program would get a part of the bytes",
+            "end that program",
+        )
+    else:
+        yield Step(
+            "busy",
+            Verdict.OK,
+            "nobody has it open" if all_seen else "none of this user's programs has it open",
+        )
+
+
+def candidates(system: System) -> list[Path]:
+    """Serial ports that are there, by their stable names where they have one."""
+    named = sorted((system.dev / "serial" / "by-id").glob("*"))
+    taken = {path.resolve() for path in named}
+    plain = sorted(path for kind in ("ttyUSB*", "ttyACM*") for path in system.dev.glob(kind))
+    return named + [path for path in plain if path.resolve() not in taken]
+
+
+def holders(device: Path, system: System) -> tuple[list[str], bool]:
+    """Other processes that have a device open, and whether all could be looked at."""
+    found = []
+    all_seen = True
+    for process in system.proc.glob("[0-9]*"):
+        if process.name == str(os.getpid()):
+            continue
+        try:
+            links = [os.readlink(fd) for fd in (process / "fd").iterdir()]
+        except PermissionError:
+            all_seen = False
+            continue
+        except OSError:
+            continue  # it has ended
+        if str(device) in links:
+            name = "?"
+            with suppress(OSError):
+                name = (process / "comm").read_text().strip()
+            found.append(f"{name} (process {process.name})")
+    return found, all_seen
+
+
+def _group(device: Path) -> str:
+    number = device.stat().st_gid
+    try:
+        return grp.getgrgid(number).gr_name
+    except KeyError:
+        return str(number)
+
+
+def interface_step(name: str, system: System) -> Step:
+    """Examine a CAN interface."""
+    there = system.sys / "class" / "net" / name
+    if not there.exists():
+        others = sorted(path.name for path in there.parent.glob("*can*"))
+        found = f"there is no CAN interface {name}" + (f", but {', '.join(others)}" if others else "")
+        return Step("interface", Verdict.FAIL, found, "plug the adapter in, or load its driver")
+    flags = int(_read(there / "flags") or "0", 16)
+    if not flags & _IFF_UP:
+        fix = f"sudo ip link set {name} up type can bitrate 1000000 (for CAN FD: dbitrate 5000000 fd on)"
+        return Step("interface", Verdict.FAIL, f"{name} is down", fix)
+    return Step("interface", Verdict.OK, f"{name} is up; `ip -details link show {name}` tells its bit rate")
+
+
+def usb(name: str, system: System) -> Iterator[Step]:
+    """What an adapter's driver does to latency.
+
+    Parameters
+    ----------
+    name : str
+        Of the device: ``ttyUSB0``.
+    system : System
+        Where to look.
+
+    Yields
+    ------
+    Step
+        One for each setting that the device has.
+    """
+    timer = system.sys / "bus" / "usb-serial" / "devices" / name / "latency_timer"
+    latency_ms = _read(timer)
+    if latency_ms.isdigit():
+        slow = int(latency_ms) > 1
+        yield Step(
+            "latency timer",
+            Verdict.WARN if slow else Verdict.OK,
+            f"{latency_ms} ms" + (": samples come in bursts of that length" if slow else ""),
+            f"echo 1 | sudo tee {timer}; for good: install the udev rule {RULES}" if slow else "",
+        )
+    flags = _read(system.sys / "class" / "tty" / name / "flags")
+    if flags:
+        quick = bool(int(flags, 16) & _LOW_LATENCY)
+        yield Step(
+            "low latency",
+            Verdict.OK if quick else Verdict.WARN,
+            "set" if quick else "not set: the system may hold bytes back",
+            "" if quick else f"sudo setserial /dev/{name} low_latency",
+        )
+    device = (system.sys / "class" / "tty" / name / "device").resolve()
+    for folder in (device, *device.parents):
+        if (folder / "idVendor").exists():
+            sleeps = _read(folder / "power" / "control") == "auto"
+            control = folder / "power" / "control"
+            yield Step(
+                "USB autosuspend",
+                Verdict.WARN if sleeps else Verdict.OK,
+                "on: the adapter may fall asleep" if sleeps else "off",
+                f"echo on | sudo tee {control}; for good: install the udev rule {RULES}" if sleeps else "",
+            )
+            return
+
+
+def _read(path: Path) -> str:
+    """A small file of the system, or nothing."""
+    try:
+        return path.read_text().strip()
+    except OSError:
+        return ""

@@ -1,0 +1,186 @@
+"""Messages for the faults of a settings file: place, expected, got."""
+
+import difflib
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Final, Literal, TypeAlias, get_args, get_origin
+
+from pydantic import ValidationError
+
+from imudrv.files.model import Model
+
+MAX_FAULTS: Final = 50
+"""Most faults that one message tells."""
+
+
+_TIME: Final = "a time in the way of 2026-11-22T10:00:00Z"
+
+
+_EXPECTED: Final = {
+    "float_type": "a number",
+    "finite_number": "a finite number",
+    "int_type": "a whole number",
+    "int_from_float": "a whole number",
+    "bool_type": "true or false",
+    "string_type": "text",
+    "string_too_short": "text of {min_length} characters or more",
+    "string_too_long": "text of at most {max_length} characters",
+    "string_pattern_mismatch": "text that matches {pattern}",
+    "greater_than": "more than {gt}",
+    "greater_than_equal": "at least {ge}",
+    "less_than": "less than {lt}",
+    "less_than_equal": "at most {le}",
+    "literal_error": "{expected}",
+    "tuple_type": "a list",
+    "list_type": "a list",
+    "dict_type": "a mapping (key: value)",
+    "model_type": "a mapping (key: value)",
+    "datetime_type": _TIME,
+    "datetime_parsing": _TIME,
+    "datetime_from_date_parsing": _TIME,
+    "timezone_aware": f"{_TIME}, with its zone",
+}
+
+
+_Place: TypeAlias = tuple[str | int, ...]
+
+
+def header_faults(document: object, model: type[Model]) -> Iterator[str]:
+    """Compare `format` and `version` by type too: pydantic takes true and 1.0 for 1."""
+    for name in ("format", "version"):
+        field = model.model_fields.get(name)
+        if field is None or get_origin(field.annotation) is not Literal:
+            continue
+        if not isinstance(document, Mapping) or name not in document:
+            continue
+        allowed, came = get_args(field.annotation), document[name]
+        if not any(type(came) is type(value) and came == value for value in allowed):
+            yield f"{name}: expected {' or '.join(map(str, allowed))}, got {shown_value(came)}"
+
+
+def validation_faults(error: ValidationError, document: object, model: type[Model]) -> list[str]:
+    """Put what pydantic found into sentences, one for each place."""
+    told: dict[tuple[str, str], list[str]] = {}
+    for place, e in _located(error.errors(include_url=False), document):
+        where, name, came, values = _path(place), e["type"], e["input"], e.get("ctx", {})
+        if name == "extra_forbidden":
+            told[where, _unknown_key(str(place[-1]), _keys(model, place[:-1]))] = []
+        elif name == "missing" and isinstance(place[-1], int):
+            # One error for each absent place of a tuple, in order: the last one tells the length.
+            told[_path(place[:-1]), str(len(came))] = [f"{place[-1] + 1} {_things(came)}"]
+        elif name == "missing":
+            told[where, "missing; add it"] = []
+        elif name == "too_short" and len(came) >= values["min_length"]:
+            continue  # pydantic counts the good items only; the bad ones are told on their own
+        elif name in ("too_short", "too_long"):
+            limit = "at least {min_length}" if name == "too_short" else "at most {max_length}"
+            told[where, str(len(came))] = [f"{limit.format(**values)} {_things(came)}"]
+        elif name == "value_error":
+            told[where, str(values["error"])] = []
+        elif name in _EXPECTED:
+            quotes = "; put it in quotes" if name == "string_type" and isinstance(came, int | float) else ""
+            told.setdefault((where, shown_value(came) + quotes), []).append(_EXPECTED[name].format(**values))
+        else:
+            told[where, f"{e['msg']}, got {shown_value(came)}"] = []
+    return [
+        (f"{where}: " if where else "")
+        + (f"expected {' or '.join(dict.fromkeys(expected))}, got {rest}" if expected else rest)
+        for (where, rest), expected in told.items()
+    ]
+
+
+def _located(errors: Sequence[Any], document: object) -> Iterator[tuple[_Place, Any]]:
+    """Yield each error with its place in the document; of a union only the alternatives that fit best."""
+    found = [(*_place(e, document), e) for e in errors]
+    misfit: dict[tuple[_Place, str | int], tuple[bool, int]] = {}
+    for place, branch, e in found:
+        if branch is not None:
+            other_type, keys = misfit.get(branch, (False, 0))
+            odd_key = e["type"] in ("missing", "extra_forbidden")
+            misfit[branch] = other_type or place == branch[0], keys + odd_key
+    best: dict[_Place, tuple[bool, int]] = {}
+    for (union, _), score in misfit.items():
+        best[union] = min(score, best.get(union, score))
+    for place, branch, e in found:
+        if branch is None or misfit[branch] == best[branch[0]]:
+            yield place, e
+
+
+def _place(error: Any, document: object) -> tuple[_Place, tuple[_Place, str | int] | None]:
+    """Tell where an error is, and the first alternative of a union on the way (pydantic puts it in loc)."""
+    place: list[str | int] = []
+    branch = None
+    here: Any = document
+    for i, step in enumerate(error["loc"]):
+        if _leads_on(here, step):
+            place.append(step)
+            here = here[step]
+        elif error["type"] == "missing" and i == len(error["loc"]) - 1:
+            place.append(step)
+        elif branch is None:
+            branch = tuple(place), step
+    return tuple(place), branch
+
+
+def _leads_on(here: object, step: str | int) -> bool:
+    if isinstance(here, Mapping):
+        return step in here
+    return isinstance(here, list | tuple) and step in range(len(here))
+
+
+def _keys(annotation: Any, place: _Place) -> set[str]:
+    """Tell the keys that the model knows at a place."""
+    if isinstance(annotation, type) and issubclass(annotation, Model):
+        fields = annotation.model_fields
+        if not place:
+            return set(fields)
+        field = fields.get(str(place[0]))
+        return _keys(field.annotation, place[1:]) if field else set()
+    inside = place[1:] if get_origin(annotation) in (tuple, list, dict) else place
+    return set().union(*(_keys(argument, inside) for argument in get_args(annotation)))
+
+
+def _unknown_key(name: str, known: set[str]) -> str:
+    near = difflib.get_close_matches(name[:100], known, 1)
+    return "unknown key; " + (f"did you mean {near[0]}?" if near else f"known are {', '.join(sorted(known))}")
+
+
+def _path(place: _Place) -> str:
+    steps = (f"[{step}]" if isinstance(step, int) else f".{quoted_name(step)}" for step in place)
+    return "".join(steps).removeprefix(".")
+
+
+def quoted_name(key: str) -> str:
+    """Return a key as messages show it."""
+    return key if re.fullmatch(r"[\w-]{1,60}", key) else _short(key)
+
+
+def _short(value: object) -> str:
+    """Represent a value in less than a line, with no control characters."""
+    text = repr(value[:60] if isinstance(value, str) else value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def shown_value(value: object) -> str:
+    """Return a value as messages show it, shortened."""
+    if value is None:
+        return "nothing"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return f"text {_short(value)}"
+    if isinstance(value, Mapping):
+        return "a mapping"
+    return f"a list of {len(value)}" if isinstance(value, list | tuple) else _short(value)
+
+
+def _things(items: Sequence[object]) -> str:
+    if all(isinstance(item, int | float) for item in items):
+        return "numbers"
+    return "rows" if all(isinstance(item, list | tuple) for item in items) else "values"
+
+
+def bounded(faults: list[str]) -> list[str]:
+    """Return at most `MAX_FAULTS` faults, and how many more there are."""
+    rest = len(faults) - MAX_FAULTS
+    return [*faults[:MAX_FAULTS], f"and {rest} more"] if rest > 0 else faults

@@ -1,0 +1,35 @@
+"""Base of the models of settings files, and the types they share: time, vectors, matrices."""
+
+from datetime import UTC, datetime
+from typing import Annotated, TypeAlias, TypeVar
+
+from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict
+
+
+class Model(BaseModel):
+    """A section of a settings file; frozen.
+
+    Unknown keys, NaN and infinity are refused, and text or true/false where a number is meant.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+def _utc(time: datetime) -> datetime:
+    if not 2000 <= time.year < 3000:
+        raise ValueError(f"expected a date from the year 2000 on, got {time.isoformat()}")
+    return time.astimezone(UTC)
+
+
+UtcTime: TypeAlias = Annotated[AwareDatetime, AfterValidator(_utc)]
+"""A time with its zone, kept in UTC."""
+
+
+Vector3: TypeAlias = tuple[float, float, float]
+
+
+Matrix3: TypeAlias = tuple[Vector3, Vector3, Vector3]
+"""Three rows."""
+
+
+M = TypeVar("M", bound=Model)

@@ -1,0 +1,145 @@
+"""A new file that a thread of its own appends to, so that no disk holds the loop."""
+
+import errno
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from threading import Event, Thread
+from typing import Final, NamedTuple
+
+from imudrv.errors import InputError
+from imudrv.files.outputs import file_to_write
+
+PERIOD_S: Final = 0.05
+"""What waits is written this often."""
+
+
+_PAUSE_S: Final = 0.002  # between the pieces of a backlog, for the loop to come through
+
+
+_LAST_SECONDS_S: Final = 5.0
+
+
+_FULL: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+class Piece(NamedTuple):
+    """What is written at a time.
+
+    Parameters
+    ----------
+    data : bytes
+        Not too long; empty when nothing waits.
+    samples : int
+        In it.
+    more : bool
+        Whether more waits already, so that the next piece does not wait for the next round.
+    """
+
+    data: bytes
+    samples: int
+    more: bool
+
+
+_NOTHING: Final = Piece(b"", 0, False)
+
+
+class Spool:
+    """Writer of one new file.
+
+    A piece goes to the system at once and outlives this process; it goes in whole or, where the disk takes
+    only a part, that part is taken back and the piece tried again. So the file ends with a whole piece at
+    all times but the middle of a write.
+
+    Parameters
+    ----------
+    path : Path
+        There must be no such file yet.
+    head : bytes
+        What the file begins with, written at once.
+    next_piece : callable
+        Gives the next piece. Called in the thread.
+    last_piece : callable
+        Gives what ends the file.
+
+    Raises
+    ------
+    InputError
+        There is such a file, the folder cannot be written to, there is no room for the head, or see
+        `file_to_write`.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        head: bytes,
+        next_piece: Callable[[], Piece],
+        last_piece: Callable[[], bytes] = bytes,
+    ) -> None:
+        target = file_to_write(path)
+        try:
+            self._file = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+        except FileExistsError as error:
+            raise InputError(
+                f"{path}: expected a new file, there is one of that name; move it away or take another name"
+            ) from error
+        except OSError as error:
+            raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
+        self.sent = 0
+        self._size = 0
+        self._trouble = ""
+        if not self._append(head):
+            os.close(self._file)
+            target.unlink()
+            raise InputError(f"{path}: cannot be written: {self._trouble}")
+        self._next_piece = next_piece
+        self._last_piece = last_piece
+        self._is_closing = Event()
+        self._thread = Thread(target=self._run, name=f"writer of {path.name}", daemon=True)
+        self._thread.start()
+
+    @property
+    def trouble(self) -> str:
+        """What is wrong: ``disk full``, what the system says; empty when all is well."""
+        if not self._thread.is_alive() and not self._is_closing.is_set():
+            return "the writer has stopped"
+        return self._trouble
+
+    def close(self) -> None:
+        """Write what waits, for some seconds at the most, and let go."""
+        self._is_closing.set()
+        self._thread.join(_LAST_SECONDS_S)
+
+    def _run(self) -> None:
+        piece = _NOTHING
+        is_last = False
+        while not is_last:
+            is_last = self._is_closing.wait(PERIOD_S)
+            more = True
+            while more:
+                piece = piece if piece.data else self._next_piece()
+                if not piece.data or not self._append(piece.data):
+                    break
+                self.sent += piece.samples
+                more, piece = piece.more, _NOTHING
+                if more:
+                    time.sleep(_PAUSE_S)
+        if not piece.data:
+            self._append(self._last_piece())
+        os.close(self._file)
+
+    def _append(self, piece: bytes) -> bool:
+        """Append a piece; whether it is in the file."""
+        rest = memoryview(piece)
+        try:
+            while rest:
+                rest = rest[os.write(self._file, rest) :]
+        except OSError as error:
+            self._trouble = "disk full" if error.errno in _FULL else (error.strerror or str(error)).lower()
+            os.ftruncate(self._file, self._size)
+            os.lseek(self._file, self._size, os.SEEK_SET)
+            return False
+        self._size += len(piece)
+        self._trouble = ""
+        return True

@@ -1,0 +1,79 @@
+"""Rewrite a recording compressed."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+from mcap.records import Attachment, Channel, Message, Metadata, Schema
+from mcap.writer import Writer
+
+from imudrv.files.atomic import replacing
+from imudrv.recording.reader import Recording
+
+
+class Packed(NamedTuple):
+    """What `pack` did.
+
+    Parameters
+    ----------
+    messages : int
+        How many there are.
+    cut : bool
+        The recording ended without its end, as after a power cut; what it had is in the packed one.
+    """
+
+    messages: int
+    cut: bool
+
+
+def pack(source: Path, target: Path) -> Packed:
+    """Write a recording again, compressed and with an index.
+
+    Parameters
+    ----------
+    source : Path
+        The recording.
+    target : Path
+        Its new file, the same one if wanted; it appears whole or not at all.
+
+    Returns
+    -------
+    Packed
+
+    Raises
+    ------
+    InputError
+        The recording cannot be read or is damaged, or the target cannot be written.
+    """
+    recording = Recording(source)
+    schemas: dict[int, int] = {0: 0}
+    channels: dict[int, int] = {}
+    messages = 0
+    with replacing(target) as file:
+        writer = Writer(file)
+        writer.start()
+        for offset, record in recording._items():
+            if isinstance(record, Schema):
+                schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
+            elif isinstance(record, Channel):
+                channels[record.id] = writer.register_channel(
+                    record.topic, record.message_encoding, schemas.get(record.schema_id, 0), record.metadata
+                )
+            elif isinstance(record, Attachment):
+                writer.add_attachment(
+                    record.create_time, record.log_time, record.name, record.media_type, record.data
+                )
+            elif isinstance(record, Metadata):
+                writer.add_metadata(record.name, record.metadata)
+            elif isinstance(record, Message):
+                if record.channel_id not in channels:
+                    raise recording._corrupt(offset, f"expected a known channel, got {record.channel_id}")
+                writer.add_message(
+                    channels[record.channel_id],
+                    record.log_time,
+                    record.data,
+                    record.publish_time,
+                    record.sequence,
+                )
+                messages += 1
+        writer.finish()  # type: ignore[no-untyped-call]
+    return Packed(messages, recording.cut)

@@ -1,0 +1,107 @@
+"""Export to the IMR format of Waypoint and Inertial Explorer."""
+
+from importlib.metadata import version
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imudrv.errors import InputError
+from imudrv.files.atomic import replacing
+from imudrv.recording.reader import Recording
+from imudrv.recording.tally import Exported, Tally
+from imudrv.records import Records
+from imudrv.units import DEG, NS, NS_PER_S
+
+_HEADER: Final = np.dtype(
+    [
+        ("szHeader", "S8"),
+        ("bIsIntelOrMotorola", "<i1"),  # 0: little-endian
+        ("dVersionNumber", "<f8"),
+        ("bDeltaTheta", "<i4"),  # 1: increments
+        ("bDeltaVelocity", "<i4"),
+        ("dDataRateHz", "<f8"),
+        ("dGyroScaleFactor", "<f8"),  # deg a unit
+        ("dAccelScaleFactor", "<f8"),  # m/s a unit
+        ("iUtcOrGpsTime", "<i4"),  # 1: UTC seconds of the week
+        ("iRcvTimeOrCorrTime", "<i4"),  # 0: not known
+        ("dTimeTagBias", "<f8"),
+        ("szImuName", "S32"),
+        ("reserved1", "V4"),
+        ("szProgramName", "S32"),
+        ("tCreate", "V12"),
+        ("bLeverArmValid", "<i1"),
+        ("lXoffset", "<i4"),
+        ("lYoffset", "<i4"),
+        ("lZoffset", "<i4"),
+        ("Reserved", "V354"),
+    ]
+)
+
+
+_SAMPLE: Final = np.dtype([("time", "<f8"), ("gyro", "<i4", 3), ("accelerometer", "<i4", 3)])
+
+
+_GYRO_DEG: Final = 2.0**-25  # 5.2e-10 rad; an increment may be up to 64 deg
+
+
+_ACCELEROMETER_M_S: Final = 2.0**-24  # 6.0e-8 m/s; up to 128 m/s
+
+
+_WEEK_NS: Final = 7 * 86_400 * NS_PER_S
+
+
+_SUNDAY_NS: Final = 4 * 86_400 * NS_PER_S  # the epoch was a Thursday, weeks begin on Sunday
+
+
+def export_imr(recording: Recording, target: Path) -> Exported:
+    """Export as IMR."""
+    tally = Tally()
+    unit = recording.origin.get("unit", "")
+    header = np.zeros(1, _HEADER)
+    header["szHeader"] = b"$IMURAW"
+    header["dVersionNumber"] = 8.80
+    header["bDeltaTheta"] = header["bDeltaVelocity"] = 1
+    header["dDataRateHz"] = recording.profile.sample_rate_hz
+    header["dGyroScaleFactor"] = _GYRO_DEG
+    header["dAccelScaleFactor"] = _ACCELEROMETER_M_S
+    header["iUtcOrGpsTime"] = 1
+    header["szImuName"] = f"IMU50 {unit}".strip().encode("ascii", "replace")[:31]
+    header["szProgramName"] = f"imudrv {version('imu50')}".encode()[:31]
+    gyro = _Rounding("angle", "deg", _GYRO_DEG)
+    accelerometer = _Rounding("velocity", "m/s", _ACCELEROMETER_M_S)
+    with replacing(target) as file:
+        file.write(header.tobytes())
+        for increments in tally.of(recording.increments()):
+            samples = np.zeros(increments.size, _SAMPLE)
+            samples["time"] = ((increments["t_ns"] + _SUNDAY_NS) % _WEEK_NS) * NS
+            samples["gyro"] = gyro.feed(increments["dtheta_b"] / DEG, increments)
+            samples["accelerometer"] = accelerometer.feed(increments["dv_b"], increments)
+            file.write(samples.tobytes())
+    return tally.result
+
+
+class _Rounding:
+    """Increments to whole units; what is left over goes on to the next."""
+
+    def __init__(self, name: str, unit: str, scale: float) -> None:
+        self._name = name
+        self._unit = unit
+        self._scale = scale
+        self._left = np.zeros(3)
+
+    def feed(self, values: NDArray[np.float64], increments: Records) -> NDArray[np.float64]:
+        sums = self._left + np.cumsum(values / self._scale, axis=0)
+        whole = np.rint(sums)
+        self._left = sums[-1] - whole[-1]
+        units = np.diff(whole, axis=0, prepend=0)
+        outside = ~(np.abs(units) < 2**31).all(axis=1)
+        if outside.any():
+            first = int(outside.argmax())
+            raise InputError(
+                f"sample {increments['counter'][first]}: expected {self._name} increments "
+                f"below {2**31 * self._scale:g} {self._unit}, as many as the format holds, "
+                f"got {values[first].tolist()}"
+            )
+        return units
