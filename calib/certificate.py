@@ -7,19 +7,19 @@ from typing import Any, Final
 
 import numpy as np
 
-from calib.identification import Findings
-from calib.lever_arms.gauge import Arms
+from calib.identification import IdentificationResult
+from calib.lever_arms.gauge import LeverArms
 from calib.result_file import inputs_document, outcome_document
 from imudrv.arrays import Array
 from imudrv.calibration import Calibration, SensingPoints, SizeEffect, read_calibration, write_calibration
 from imudrv.errors import FaultyFileError, InputError
 from imudrv.units import MM
 
-FOUND: Final = "inner_lever_arms"
+PROVENANCE_IDENTIFIED: Final = "inner_lever_arms"
 """Where the provenance says how they were found."""
 
 
-CHANGED: Final = "inner_lever_arms_gauge"
+PROVENANCE_CONVERTED: Final = "inner_lever_arms_gauge"
 """Where it says from which file their gauge was converted."""
 
 
@@ -31,7 +31,7 @@ _COVARIANCE_DECIMALS: Final = 9
 """Of their covariance, mm^2."""
 
 
-def certificate(findings: Findings, arms: Arms) -> Calibration:
+def certificate(findings: IdentificationResult, arms: LeverArms) -> Calibration:
     """Make the unit's new certificate: its calibration, with the arms and how they were found.
 
     Parameters
@@ -49,17 +49,17 @@ def certificate(findings: Findings, arms: Arms) -> Calibration:
     Raises
     ------
     InputError
-        The result is one that nothing may be certified on, see `Identification.refusals`.
+        The result is one that nothing may be certified on, see `LeverArmEstimate.refusals`.
     """
     result = findings.result
     if result.refusals:
         raise InputError(f"no certificate: {'; '.join(result.refusals)}")
     found = {"method": result.method, **inputs_document(findings), **outcome_document(result)}
-    return with_arms(findings.basis.calibration, arms, FOUND, found, findings.created)
+    return with_lever_arms(findings.basis.calibration, arms, PROVENANCE_IDENTIFIED, found, findings.created)
 
 
-def with_arms(
-    calibration: Calibration, arms: Arms, key: str, how: dict[str, Any], when: datetime | None = None
+def with_lever_arms(
+    calibration: Calibration, arms: LeverArms, key: str, how: dict[str, Any], when: datetime | None = None
 ) -> Calibration:
     """Put lever arms into a calibration.
 
@@ -81,8 +81,8 @@ def with_arms(
     Calibration
     """
     provenance = dict(calibration.provenance or {})
-    if key == FOUND:
-        provenance.pop(CHANGED, None)
+    if key == PROVENANCE_IDENTIFIED:
+        provenance.pop(PROVENANCE_CONVERTED, None)
     provenance[key] = {"software": software(), **how}
     covariance = None if arms.covariance is None else arms.covariance / MM**2
     rows = np.round(arms.r_b / MM, _R_DECIMALS) + 0.0  # no -0
@@ -102,7 +102,7 @@ def with_arms(
     )
 
 
-def arms_of(calibration: Calibration, name: str) -> Arms:
+def lever_arms_of(calibration: Calibration, name: str) -> LeverArms:
     """Take the lever arms out of a calibration.
 
     Parameters
@@ -126,7 +126,7 @@ def arms_of(calibration: Calibration, name: str) -> Arms:
         raise InputError(
             f"{name}: expected a calibration with size_effect, got one without; identify them first"
         )
-    return Arms(effect.r_m, effect.covariance_m2, effect.gauge)
+    return LeverArms(effect.r_m, effect.covariance_m2, effect.gauge)
 
 
 def check_target(path: Path, calibration: Calibration) -> None:

@@ -1,6 +1,6 @@
 """From capture files to findings: what was found, and all that it was made of.
 
-Certificate and report are functions of `Findings`; nothing is computed a second time behind it.
+Certificate and report are functions of `IdentificationResult`; nothing is computed a second time behind it.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -12,12 +12,12 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from calib.detection.acceptance import Limits
-from calib.estimation.joint import joint
-from calib.estimation.plain import plain
-from calib.estimation.result import DIFFERENCES, Extra, Identification, RunResult
-from calib.estimation.runs import Evidence, Priors, Run, collect
-from calib.lever_arms.gauge import Arms
+from calib.detection.acceptance import RotationLimits
+from calib.estimation.joint import estimate_joint
+from calib.estimation.plain import estimate_plain
+from calib.estimation.result import TO_DIFFERENCES, Extra, LeverArmEstimate, RunResult
+from calib.estimation.runs import CaptureRuns, Priors, Run, navigate_rotations
+from calib.lever_arms.gauge import LeverArms
 from imudrv.arrays import Array
 from imudrv.calibration import Calibration, coefficients
 from imudrv.capture import Capture
@@ -30,7 +30,7 @@ from imudrv.records import Records
 from imudrv.site import Site
 
 
-class Basis(NamedTuple):
+class PriorCalibration(NamedTuple):
     """The calibration that the increments were made with.
 
     Attributes
@@ -57,7 +57,7 @@ class Temperature(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Source:
+class CaptureSummary:
     """A capture and what was in it.
 
     Attributes
@@ -86,12 +86,12 @@ class Source:
     profile: str
     books: str
     temperatures: tuple[Temperature, ...]
-    evidence: Evidence
+    evidence: CaptureRuns
     channel: str | None = None
 
 
 @dataclass(frozen=True)
-class Findings:
+class IdentificationResult:
     """What a session found.
 
     Attributes
@@ -114,25 +114,25 @@ class Findings:
         What computed it.
     """
 
-    result: Identification
-    basis: Basis
+    result: LeverArmEstimate
+    basis: PriorCalibration
     site: Site
-    limits: Limits
+    limits: RotationLimits
     priors: Priors
-    sources: tuple[Source, ...]
+    sources: tuple[CaptureSummary, ...]
     created: datetime
     software: str
 
     @property
-    def arms(self) -> Arms:
+    def arms(self) -> LeverArms:
         """The lever arms in the gauge of the estimate."""
-        return Arms(self.result.R_b, self.result.covariance, self.result.gauge)
+        return LeverArms(self.result.R_b, self.result.covariance, self.result.gauge)
 
     @property
     def differences_correlation(self) -> Array:
         """Correlation of the six differences with the nuisances, shape (6, n)."""
         result = self.result
-        covariance = DIFFERENCES @ (result.sigma.reshape(9, 1) * result.correlation)
+        covariance = TO_DIFFERENCES @ (result.sigma.reshape(9, 1) * result.correlation)
         correlation: Array = covariance / result.differences_sigma.reshape(6, 1)
         return correlation
 
@@ -151,10 +151,10 @@ def scatter(run: RunResult) -> float:
     return float(np.sqrt(np.mean((left - left.mean(axis=0)) ** 2)))
 
 
-def find(
+def identify_captures(
     captures: Sequence[Path],
     profile: Profile | None,
-    basis: Basis,
+    basis: PriorCalibration,
     site: Site,
     *,
     method: Literal["joint", "plain"] = "joint",
@@ -163,7 +163,7 @@ def find(
     extra: Sequence[Extra] = (),
     channel: str | None = None,
     advance: Callable[[int], None] = lambda _: None,
-) -> Findings:
+) -> IdentificationResult:
     """Identify the inner lever arms from captures of one unit.
 
     Parameters
@@ -177,7 +177,7 @@ def find(
     site : Site
         Where the unit stands.
     method, pivot, nine, extra
-        See `calib.estimation.joint.joint`; `plain` knows no others.
+        See `calib.estimation.estimate_joint.estimate_joint`; `estimate_plain` knows no others.
     channel : str or None
         The CAN channel to read, of candump logs; needed where a log has several.
     advance : callable
@@ -190,16 +190,16 @@ def find(
     Raises
     ------
     InputError
-        A capture cannot be read or is given twice; no rotation serves, with the reasons; or what `joint` and
-        `plain` refuse.
+        A capture cannot be read or is given twice; no rotation serves, with the reasons; or what
+        `estimate_joint` and `estimate_plain` refuse.
     """
     if method == "plain" and (pivot == "fixed" or nine or extra):
         raise InputError(
             "method plain: expected neither a known pivot, nor nine components, nor more unknowns: it solves "
             "V = H R and nothing else; use method joint"
         )
-    limits, priors = Limits(), Priors()
-    sources: list[Source] = []
+    limits, priors = RotationLimits(), Priors()
+    sources: list[CaptureSummary] = []
     for path in captures:
         label = _label(path, [source.label for source in sources])
         source = _read(path, label, profile, channel, basis.calibration, site, limits, priors, advance)
@@ -214,12 +214,12 @@ def find(
         )
     try:
         if method == "plain":
-            result = plain(runs, priors)
+            result = estimate_plain(runs, priors)
         else:
-            result = joint(runs, priors, pivot=pivot, nine=nine, extra=extra)
+            result = estimate_joint(runs, priors, pivot=pivot, nine=nine, extra=extra)
     except InputError as error:
         raise InputError("\n  ".join([str(error), *_rejections(sources)])) from None
-    return Findings(
+    return IdentificationResult(
         result,
         basis,
         site,
@@ -247,10 +247,10 @@ def _read(
     channel: str | None,
     calibration: Calibration,
     site: Site,
-    limits: Limits,
+    limits: RotationLimits,
     priors: Priors,
     advance: Callable[[int], None],
-) -> Source:
+) -> CaptureSummary:
     """Take a capture through both passes, with its books and temperatures."""
     known = replace(coefficients(calibration), r_b=None)
     capture = Capture(path, profile, channel)
@@ -270,12 +270,14 @@ def _read(
 
     try:
         with unchanged(path):  # two passes, and one for the hash
-            evidence = collect(increments, known.C_ba, site, label=label, limits=limits, priors=priors)
+            evidence = navigate_rotations(
+                increments, known.C_ba, site, label=label, limits=limits, priors=priors
+            )
             digest = sha256(path)
     except InputError as error:
         raise error if str(path) in str(error) else InputError(f"{path}: {error}") from None
     names = capture.layout.temperature_names
-    return Source(
+    return CaptureSummary(
         label,
         path.name,
         digest,
@@ -291,7 +293,7 @@ def _read(
     )
 
 
-def _rejections(sources: Sequence[Source]) -> list[str]:
+def _rejections(sources: Sequence[CaptureSummary]) -> list[str]:
     """Why motions did not serve, a line each; a line for a capture without any."""
     lines = []
     for source in sources:

@@ -6,12 +6,12 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
-from calib.estimation.result import Identification
+from calib.estimation.result import LeverArmEstimate
 from calib.estimation.runs import Priors, Run
-from calib.identification import Findings, Source, scatter
-from calib.lever_arms.gauge import Arms
+from calib.identification import CaptureSummary, IdentificationResult, scatter
+from calib.lever_arms.gauge import LeverArms
 from imudrv.arrays import Array
-from imudrv.files.atomic import replacing
+from imudrv.files.atomic import atomic_write
 from imudrv.units import ARCSEC, DEG, DEG_PER_H, MM, PPM, STANDARD_GRAVITY, UG, URAD
 
 FORMAT: Final = "imu50-identification"
@@ -20,7 +20,7 @@ FORMAT: Final = "imu50-identification"
 VERSION: Final = 1
 
 
-def result_document(findings: Findings, arms: Arms) -> dict[str, Any]:
+def result_document(findings: IdentificationResult, arms: LeverArms) -> dict[str, Any]:
     """Put the whole result into plain data, units in the names.
 
     Parameters
@@ -59,7 +59,7 @@ def result_document(findings: Findings, arms: Arms) -> dict[str, Any]:
         },
         "nuisances_si": [
             {"name": n.name, "value": n.value, "sigma": n.sigma, "prior_sigma": n.prior, "seen": n.seen}
-            for n in result.nuisances
+            for n in result.parameters
         ],
         "correlation_of_r_with_nuisances": result.correlation.tolist(),
         "correlation_of_differences_with_nuisances": findings.differences_correlation.tolist(),
@@ -69,7 +69,7 @@ def result_document(findings: Findings, arms: Arms) -> dict[str, Any]:
                 "rank": one.rank,
                 "shift_mm": None if one.shift_m is None else (one.shift_m / MM).tolist(),
             }
-            for one in result.left_out
+            for one in result.leave_one_out
         ],
         "runs": [
             {
@@ -102,11 +102,11 @@ def write_json(path: Path, document: dict[str, Any]) -> None:
     InputError
         It cannot be written.
     """
-    with replacing(path) as file:
+    with atomic_write(path) as file:
         file.write(json.dumps(document, indent=1, allow_nan=False).encode() + b"\n")
 
 
-def inputs_document(findings: Findings) -> dict[str, Any]:
+def inputs_document(findings: IdentificationResult) -> dict[str, Any]:
     """What the findings rest on."""
     basis = findings.basis
     return {
@@ -118,7 +118,7 @@ def inputs_document(findings: Findings) -> dict[str, Any]:
     }
 
 
-def _capture(source: Source) -> dict[str, Any]:
+def _capture(source: CaptureSummary) -> dict[str, Any]:
     evidence = source.evidence
     return {
         "name": source.name,
@@ -150,7 +150,7 @@ def _priors(priors: Priors) -> dict[str, float]:
     }
 
 
-def outcome_document(result: Identification) -> dict[str, Any]:
+def outcome_document(result: LeverArmEstimate) -> dict[str, Any]:
     """The figures that a reader of the certificate asks for first."""
     names = ("x_minus_y", "x_minus_z")
     return {

@@ -30,7 +30,7 @@ from imudrv.service import settings
 from imudrv.service.loop import Service
 from imudrv.service.monitor import monitor
 from imudrv.service.printer import Printer
-from imudrv.service.runtime import Signals
+from imudrv.service.runtime import SignalFlags
 from imudrv.service.settings import Settings
 from imudrv.service.status import EXIT_CODES
 from imudrv.service.status_socket import ask
@@ -272,7 +272,7 @@ def _play(arguments: argparse.Namespace) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    signals = Signals()
+    signals = SignalFlags()
     names = set(Settings.model_fields) - {"format", "version"}
     given = {name: getattr(arguments, name) for name in names}
     with signals.caught(SIGHUP), Printer(sys.stdout) as printer, Printer(sys.stderr) as warnings:

@@ -31,7 +31,7 @@ _STUFFING: Final = 1.2
 
 
 @dataclass(frozen=True)
-class Heard:
+class TrafficSummary:
     """What arrived, as a profile reads it; it begins with the first good frame, if there is one.
 
     Parameters
@@ -72,7 +72,7 @@ class Heard:
         return spoilt * 100 < self.counts.expected
 
 
-def hear(profile: Profile, data: bytes | Records) -> Heard:
+def decode_traffic(profile: Profile, data: bytes | Records) -> TrafficSummary:
     """Read data as a profile says.
 
     Parameters
@@ -106,7 +106,7 @@ def hear(profile: Profile, data: bytes | Records) -> Heard:
     else:
         messages = {m.id or 0: int(np.count_nonzero(data["id"] == m.id)) for m in profile.messages}
         syncs = sum(messages.values())
-    return Heard(
+    return TrafficSummary(
         len(data),
         syncs,
         tracker.counts,
@@ -117,7 +117,7 @@ def hear(profile: Profile, data: bytes | Records) -> Heard:
     )
 
 
-def best(candidates: Iterable[Profile], data: bytes | Records) -> Profile | None:
+def best_profile(candidates: Iterable[Profile], data: bytes | Records) -> Profile | None:
     """The profile that reads most of the data.
 
     Parameters
@@ -135,7 +135,7 @@ def best(candidates: Iterable[Profile], data: bytes | Records) -> Profile | None
     transport = "serial" if isinstance(data, bytes) else "can"
     found: tuple[int, Profile] | None = None
     for profile in candidates:
-        if profile.transport == transport and (heard := hear(profile, data)).fits:
+        if profile.transport == transport and (heard := decode_traffic(profile, data)).fits:
             read = heard.counts.frames * sum(m.length for m in profile.messages if m.every == 1)
             if found is None or read > found[0]:
                 found = read, profile
@@ -303,7 +303,7 @@ def line_load(profile: Profile) -> float:
     return sum(shares) * rate / line.bitrate
 
 
-def explain(profile: Profile, heard: Heard, seconds: float) -> str:
+def explain(profile: Profile, heard: TrafficSummary, seconds: float) -> str:
     """What arrived, in a line for people.
 
     Parameters
@@ -330,6 +330,6 @@ def explain(profile: Profile, heard: Heard, seconds: float) -> str:
     return "; ".join(words)
 
 
-def rate(heard: Heard, seconds: float) -> float:
+def rate(heard: TrafficSummary, seconds: float) -> float:
     """Samples a second that the unit counted."""
     return heard.counts.expected / seconds

@@ -14,7 +14,7 @@ from imudrv.records import INCREMENTS, PULSES, Flag, Records
 from imudrv.wire.decoder import FrameDecoder
 
 
-class Sampled(NamedTuple):
+class PipelineOutput(NamedTuple):
     """What became of one arrival.
 
     Parameters
@@ -29,7 +29,7 @@ class Sampled(NamedTuple):
     increments: Records
 
 
-_NOTHING: Final = Sampled(np.zeros(0, PULSES), np.zeros(0, INCREMENTS))
+_NOTHING: Final = PipelineOutput(np.zeros(0, PULSES), np.zeros(0, INCREMENTS))
 
 
 class Pipeline:
@@ -56,7 +56,7 @@ class Pipeline:
         self._repeats = False
         self._last_ns = 0  # time by the counter of the newest increment handed on, while it matters
 
-    def feed(self, data: bytes | memoryview | Records, t_ns: int) -> Sampled:
+    def feed(self, data: bytes | memoryview | Records, t_ns: int) -> PipelineOutput:
         """Take in what arrived.
 
         Parameters
@@ -72,13 +72,13 @@ class Pipeline:
         """
         return self._through(self.decoder.feed(data, t_ns))
 
-    def close(self) -> Sampled:
+    def close(self) -> PipelineOutput:
         """End of the line: what was held back comes out."""
         pulses, increments = self._through(self.decoder.close())
         rest = self._compensator.close()
         if self._repeats:
             rest = self._unrepeated(rest)
-        return Sampled(pulses, np.concatenate([increments, self.clock.stamp(rest)]))
+        return PipelineOutput(pulses, np.concatenate([increments, self.clock.stamp(rest)]))
 
     def exchange(self, coefficients: Coefficients) -> None:
         """Go over to another calibration between two samples.
@@ -99,19 +99,19 @@ class Pipeline:
         """Whether a new calibration is still on its way in."""
         return self._next is not None
 
-    def _through(self, frames: Records) -> Sampled:
+    def _through(self, frames: Records) -> PipelineOutput:
         if not len(frames):
             return _NOTHING
         pulses = self.tracker.feed(frames)
         if not len(pulses):
-            return Sampled(pulses, _NOTHING.increments)
+            return PipelineOutput(pulses, _NOTHING.increments)
         self.clock.feed(pulses)
         increments = self._compensator.feed(pulses)
         if self._next is not None:
             increments = self._exchanged(self._next, pulses, increments)
         if self._repeats:
             increments = self._unrepeated(increments)
-        return Sampled(pulses, self.clock.stamp(increments))
+        return PipelineOutput(pulses, self.clock.stamp(increments))
 
     def _exchanged(self, new: Compensator, pulses: Records, old: Records) -> Records:
         """Increments of the old calibration up to where the new one knows its rates, then of the new one."""

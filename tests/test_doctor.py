@@ -20,11 +20,12 @@ from imudrv.doctor import device
 from imudrv.doctor import examine as examination
 from imudrv.doctor.device import System
 from imudrv.doctor.examine import examine
-from imudrv.doctor.verdict import Step, Verdict
+from imudrv.doctor.verdict import Finding, Verdict
 from imudrv.errors import InputError
 from imudrv.files.settings_file import parse
 from imudrv.ports import Arrival, Port, PortLostError
 from imudrv.ports.url import split
+from imudrv.profiles.schema import Profile, SerialLine
 from imudrv.records import MESSAGE, Reason, Source
 from imudrv.sim.capture import wire
 from imudrv.sim.live import play
@@ -47,18 +48,18 @@ def scenario(duration_s: float, **sections: Any) -> Scenario:
     return parse(document, Scenario, "test")
 
 
-def sent(profile: profiles.Profile, duration_s: float = 1.0, **sections: Any) -> Any:
+def sent(profile: Profile, duration_s: float = 1.0, **sections: Any) -> Any:
     pieces = [piece.data for piece in wire(scenario(duration_s, **sections), profile.layout())]
     return b"".join(pieces) if profile.transport == "serial" else np.concatenate(pieces)  # type: ignore[arg-type]
 
 
 @pytest.fixture
-def playing() -> Iterator[Callable[[profiles.Profile, str], str]]:
+def playing() -> Iterator[Callable[[Profile, str], str]]:
     """Plays a profile on a port in real time; where to listen."""
     stop = threading.Event()
     with ThreadPoolExecutor(1) as pool:
 
-        def start(profile: profiles.Profile, target: str = "pty", **sections: Any) -> str:
+        def start(profile: Profile, target: str = "pty", **sections: Any) -> str:
             said: Queue[str] = Queue()
             pool.submit(play, scenario(600.0, **sections), profile, target, 1.0, said.put, None, stop)
             return said.get(timeout=20).split()[-1]
@@ -77,12 +78,12 @@ def line() -> Iterator[tuple[int, str]]:
     os.close(master)
 
 
-def by_name(steps: Any) -> dict[str, Step]:
+def by_name(steps: Any) -> dict[str, Finding]:
     return {step.name: step for step in steps}
 
 
 @pytest.mark.parametrize("profile", [RS422, ACC])
-def test_a_unit_of_the_right_profile_is_healthy(profile: profiles.Profile, playing: Any) -> None:
+def test_a_unit_of_the_right_profile_is_healthy(profile: Profile, playing: Any) -> None:
     steps = by_name(examine(playing(profile), profile.name, LISTEN_S))
     assert all(step.verdict is not Verdict.FAIL for step in steps.values()), steps
     assert list(steps)[:6] == ["device", "permission", "busy", "line load", "open", "data"]
@@ -163,7 +164,7 @@ def test_a_port_that_goes_away_meanwhile_is_told() -> None:
 class FakeLine(Port):
     """A serial line whose unit speaks one profile at one rate; at others noise arrives."""
 
-    def __init__(self, url: str, baudrate: int, right: int, profile: profiles.Profile) -> None:
+    def __init__(self, url: str, baudrate: int, right: int, profile: Profile) -> None:
         super().__init__(url, Source.REPLAY)
         noise = np.random.default_rng(baudrate).bytes(4000)
         self._pieces = [sent(profile, 0.2) if baudrate == right else noise]
@@ -186,11 +187,11 @@ class FakeLine(Port):
     ],
 )
 def test_a_wrong_rate_is_found_by_trying(
-    monkeypatch: pytest.MonkeyPatch, unit: profiles.Profile, rate: int, found: str, fix: str
+    monkeypatch: pytest.MonkeyPatch, unit: Profile, rate: int, found: str, fix: str
 ) -> None:
     opened = []
 
-    def open_fake(url: str, profile: profiles.Profile) -> Port:
+    def open_fake(url: str, profile: Profile) -> Port:
         baudrate = int(split(url).options.get("baudrate", profile.line.baudrate))  # type: ignore[union-attr]
         opened.append(baudrate)
         if baudrate == 115_201:
@@ -322,9 +323,7 @@ def test_a_can_interface_that_is_up_is_well(system: System) -> None:
 
 
 @pytest.mark.parametrize("profile", [CAN, CANFD])
-def test_a_unit_on_a_bus_is_healthy_and_its_identifiers_are_counted(
-    profile: profiles.Profile, playing: Any
-) -> None:
+def test_a_unit_on_a_bus_is_healthy_and_its_identifiers_are_counted(profile: Profile, playing: Any) -> None:
     bus = "can://udp_multicast/239.74.163.11?port=43221"
     playing(profile, bus)
     steps = by_name(examine(bus, profile.name, LISTEN_S))
@@ -350,7 +349,7 @@ def test_a_silent_bus_is_told() -> None:
 
 def test_a_profile_reads_a_stretch_that_begins_and_ends_anywhere() -> None:
     data = sent(RS422, 0.5)
-    heard = diagnosis.hear(RS422, data[17:-3])
+    heard = diagnosis.decode_traffic(RS422, data[17:-3])
     assert heard.fits
     assert heard.is_clean
     assert heard.counts.good == 498
@@ -360,30 +359,30 @@ def test_a_profile_reads_a_stretch_that_begins_and_ends_anywhere() -> None:
 def test_the_best_profile_is_the_one_that_reads_most() -> None:
     every = [profiles.load(name) for name in profiles.shipped()]
     for profile in every:
-        found = diagnosis.best(every, sent(profile, 0.3))
+        found = diagnosis.best_profile(every, sent(profile, 0.3))
         assert found is not None
         assert found.name == profile.name
-    assert diagnosis.best(every, b"") is None
-    assert diagnosis.best(every, np.zeros(0, MESSAGE)) is None
+    assert diagnosis.best_profile(every, b"") is None
+    assert diagnosis.best_profile(every, np.zeros(0, MESSAGE)) is None
 
 
 def test_a_wrong_check_is_told_apart_from_a_wrong_frame() -> None:
     frames = bytearray(sent(RS422, 0.1))
     frames[43::44] = bytes(b ^ 1 for b in frames[43::44])
-    heard = diagnosis.hear(RS422, bytes(frames))
+    heard = diagnosis.decode_traffic(RS422, bytes(frames))
     assert Reason.CHECK_FAILED in heard.rejected
     step = examination.mismatch(RS422, heard, None, True)
     assert "sync EB 90 seen 100 times, CRC never right" in step.found
 
 
 def test_a_unit_that_reports_a_fault_or_another_rate_is_told() -> None:
-    heard = replace(diagnosis.hear(RS422, sent(RS422, 0.2)), set_bits=("power", "warm-up"))
-    steps = by_name(examination.judge(RS422, heard, 0.5, True))
+    heard = replace(diagnosis.decode_traffic(RS422, sent(RS422, 0.2)), set_bits=("power", "warm-up"))
+    steps = by_name(examination.check_traffic(RS422, heard, 0.5, True))
     assert steps["status"].verdict is Verdict.WARN
     assert steps["status"].found == "power, warm-up"
     assert steps["rate"].verdict is Verdict.FAIL
     assert "expected 1000 samples/s, the unit counts 400" in steps["rate"].found
-    assert "rate" not in by_name(examination.judge(RS422, heard, 0.5, False))
+    assert "rate" not in by_name(examination.check_traffic(RS422, heard, 0.5, False))
 
 
 def test_the_line_load_is_that_of_the_interface_document() -> None:

@@ -15,9 +15,9 @@ from calib.cli.main import main as calib
 from imudrv.calibration import read_calibration, write_calibration
 from imudrv.cli import main as imudrv
 from imudrv.errors import InputError
-from imudrv.files.atomic import replacing
+from imudrv.files.atomic import atomic_write
 from imudrv.files.outputs import file_to_write
-from imudrv.files.spool import Piece, Spool
+from imudrv.files.spool import AppendThread, Piece
 from imudrv.recording.export import export
 from imudrv.recording.reader import Recording
 from imudrv.sim.scenario import NOMINAL
@@ -188,7 +188,7 @@ def test_a_symbolic_link_is_followed(command: str, there: bool, here: Path) -> N
 
 def test_a_link_that_leads_in_a_circle_is_refused(here: Path) -> None:
     os.symlink("it", "it")
-    with pytest.raises(InputError, match="it: cannot be written: Too many levels"), replacing(here / "it"):
+    with pytest.raises(InputError, match="it: cannot be written: Too many levels"), atomic_write(here / "it"):
         pass
 
 
@@ -270,13 +270,13 @@ def test_a_live_file_is_made_neither_of_a_pipe_nor_of_standard_output(here: Path
     os.mkfifo("pipe")
     for name, what in (("pipe", "got a pipe"), ("-", "cannot go to standard output")):
         with pytest.raises(InputError, match=f"{name}: expected a file.*{what}"):
-            Spool(Path(name), b"head", lambda: Piece(b"", 0, False))
+            AppendThread(Path(name), b"head", lambda: Piece(b"", 0, False))
     assert stat.S_ISFIFO(os.stat("pipe").st_mode)
     assert not os.path.lexists("-")
 
 
 def test_a_live_file_goes_to_where_a_link_points(here: Path) -> None:
     os.symlink("far", "link")
-    Spool(Path("link"), b"head", lambda: Piece(b"", 0, False)).close()
+    AppendThread(Path("link"), b"head", lambda: Piece(b"", 0, False)).close()
     assert os.readlink("link") == "far"
     assert (here / "far").read_bytes() == b"head"

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from imudrv.calibration import write_calibration
 from imudrv.profiles import load
 from imudrv.records import PULSES
-from imudrv.service.runtime import quiet_memory
+from imudrv.service.runtime import frozen_gc
 from imudrv.sim.scenario import NOMINAL
 from imudrv.wire.datagram import SIZE
 from imudrv.wire.encode import StreamEncoder
@@ -99,12 +99,12 @@ def one_round(samples: int, service: bool, folder: Path) -> NDArray[np.float64]:
     came_ns = np.zeros(samples, np.int64)
     listener = os.fork()
     if listener == 0:
-        with quiet_memory():
+        with frozen_gc():
             receive(inlet, *((8, SIZE) if service else (4, FRAME)), came_ns)
         np.save(folder / "came.npy", came_ns)
         os._exit(0)
     sent_ns = np.zeros(samples, np.int64)
-    with quiet_memory():
+    with frozen_gc():
         play(master, sent_ns)
     os.waitpid(listener, 0)
     middle.send_signal(signal.SIGTERM)

@@ -23,10 +23,10 @@ from rich.progress import track
 from rich.table import Table
 from scipy.stats import chi2
 
-from calib.estimation.joint import joint
-from calib.estimation.plain import plain
-from calib.estimation.result import DIFFERENCES, Identification
-from calib.estimation.runs import Priors, Run, collect
+from calib.estimation.joint import estimate_joint
+from calib.estimation.plain import estimate_plain
+from calib.estimation.result import TO_DIFFERENCES, LeverArmEstimate
+from calib.estimation.runs import Priors, Run, navigate_rotations
 from imudrv import profiles
 from imudrv.calibration import Calibration, coefficients
 from imudrv.files.settings_file import parse
@@ -34,7 +34,7 @@ from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import rate_filter
 from imudrv.records import Flag, Records
 from imudrv.sim.scenario import NOMINAL, Residuals, Scenario, Unit
-from imudrv.sim.unit import draw, simulate
+from imudrv.sim.unit import draw_true_unit, simulate
 from imudrv.units import ARCSEC, DEG, DEG_PER_H, MM, UG, URAD
 
 Array = NDArray[np.float64]
@@ -103,7 +103,7 @@ def unit(seed: int, budget: Budget) -> Calibration:
         accelerometer_misalignment_urad=budget.misalignment_urad,
     )
     nominal = scenario(seed, NOMINAL, "z_up", 1, budget)
-    real = draw(nominal.model_copy(update={"unit": Unit(residuals=residuals)}))
+    real = draw_true_unit(nominal.model_copy(update={"unit": Unit(residuals=residuals)}))
     document = json.loads(NOMINAL.model_dump_json(exclude_none=True))
     document["gyro"] = {
         "scale_arcsec_per_pulse": (real.gyro_scale / ARCSEC).tolist(),
@@ -163,7 +163,7 @@ def case(seed: int, signs: tuple[int, ...], budget: Budget) -> tuple[list[Run], 
     for sign in signs:
         for pose in POSES:
             turn = scenario(seed, real, pose, sign, budget)
-            found = collect(
+            found = navigate_rotations(
                 partial(iter, [increments(turn)]),
                 np.eye(3),
                 turn.site,
@@ -187,7 +187,7 @@ class Tally:
         self.covariances: list[Array] = []
         self.chi_square: list[float] = []
 
-    def add(self, found: Identification, truth: Array) -> None:
+    def add(self, found: LeverArmEstimate, truth: Array) -> None:
         """Compare an estimate with the truth."""
         self.errors.append((found.R_b - truth).ravel() / MM)
         self.covariances.append(found.covariance / MM**2)
@@ -198,8 +198,8 @@ class Tally:
         errors, covariances = np.array(self.errors), np.array(self.covariances)
         n = len(errors)
         rms = np.sqrt((errors**2).mean(axis=1))
-        six = errors @ DIFFERENCES.T
-        inverse = np.linalg.inv(DIFFERENCES @ covariances @ DIFFERENCES.T)
+        six = errors @ TO_DIFFERENCES.T
+        inverse = np.linalg.inv(TO_DIFFERENCES @ covariances @ TO_DIFFERENCES.T)
         scatter = float(np.sqrt((errors**2).mean()))
         predicted = float(np.sqrt(np.trace(covariances, axis1=1, axis2=2).mean() / 9.0))
         low, high = (float(chi2.ppf(p, 6 * n)) / n for p in (0.025, 0.975))
@@ -232,12 +232,12 @@ def montecarlo(seeds: Iterable[int], signs: tuple[int, ...], budget: Budget) -> 
     Returns
     -------
     list of Statistics
-        Of `joint` and of `plain`.
+        Of `estimate_joint` and of `estimate_plain`.
     """
     tallies = Tally("joint"), Tally("plain")
     for seed in seeds:
         runs, truth = case(seed, signs, budget)
-        for tally, method in zip(tallies, (joint, plain), strict=True):
+        for tally, method in zip(tallies, (estimate_joint, estimate_plain), strict=True):
             tally.add(method(runs, budget.priors), truth)
     return [tally.statistics() for tally in tallies]
 

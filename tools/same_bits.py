@@ -31,9 +31,9 @@ import numba
 import numpy as np
 import scipy
 
-from calib.identification import Basis, find
+from calib.identification import PriorCalibration, identify_captures
 from calib.validation.navigate import navigate
-from calib.validation.trial import Setting
+from calib.validation.trial import TrialSettings
 from imudrv.calibration import Calibration, coefficients
 from imudrv.files.settings_file import parse
 from imudrv.imu.coefficients import Coefficients
@@ -241,9 +241,11 @@ def identified() -> Results:
             run = scenario([TURN], pose=pose, residuals=residuals)
             captures.append(Path(folder, f"{pose}.raw"))
             captures[-1].write_bytes(b"".join(data for data, _ in record(run, profile.layout())))
-        options: dict[str, Any] = {"joint": {}, "skew": {"extra": ("skew",)}, "plain": {"method": "plain"}}
+        options: dict[str, Any] = {"joint": {}, "plain": {"method": "plain"}}
         for name, option in options.items():
-            found = find(captures, profile, Basis(WHOLE, "unit", ""), run.site, **option).result
+            found = identify_captures(
+                captures, profile, PriorCalibration(WHOLE, "unit", ""), run.site, **option
+            ).result
             yield f"identify, {name}: arms", sha256(found.R_b)
             yield f"identify, {name}: covariance", sha256(found.covariance, found.correlation)
             yield f"identify, {name}: residuals", sha256(*(run.v_n - run.fitted_n for run in found.runs))
@@ -258,7 +260,7 @@ def validated() -> Results:
         decoder, tracker = CaptureDecoder(layout), SequenceTracker(layout)
         pulses = [tracker.feed(decoder.feed(data)) for data, _ in record(run, layout)]
         for what, options in variants.items():
-            trial = navigate(name, pulses, Setting(layout, WHOLE, run.site, ALIGN_S, **options))
+            trial = navigate(name, pulses, TrialSettings(layout, WHOLE, run.site, ALIGN_S, **options))
             yield f"validate, {name}{what}", sha256(trial.normal.v_n, trial.compensated.v_n)
 
 

@@ -1,7 +1,7 @@
-"""Leading through a session: samples in, screen and journal out; the work of a thread of its own.
+"""Run a bench session: feed the procedure, write journal and recordings, drive the screen (own thread).
 
-The service reads the unit in the main thread, as it does in production. One of its sinks is the `Tap`, a
-queue, from which `Conduct` takes samples: it feeds the engine, journals what that says, begins and ends
+The service reads the unit in the main thread, as it does in production. One of its sinks is the `QueueSink`,
+from which `SessionController` takes samples: it feeds the engine, journals its events, begins and ends
 recordings, shows the view and reads keys. Engine and session do not know each other.
 
 The worker may be late, by seconds on a loaded machine or a slow disk, and the evidence is right all the same:
@@ -10,7 +10,7 @@ The worker may be late, by seconds on a loaded machine or a slow disk, and the e
   worker comes to that event: the service keeps the last minutes of the line (`imudrv.sinks.history`).
 - A step is accepted, shown as good and journaled only after its recording has been closed, decoded and found
   to hold every sample of the evidence. Otherwise the step is rejected with that reason and asked again.
-- The worker never waits for the terminal: a `Screen` writes in a thread of its own.
+- The worker never waits for the terminal: a `OperatorScreen` writes in a thread of its own.
 
 A session goes through stages: the steps, the result, the decision, the verification. Each leaves its line in
 the journal, so that a session that is resumed goes on behind the last.
@@ -26,11 +26,11 @@ from typing import Final
 
 import numpy as np
 
-from calib.bench.evidence import Attempt, Left, Result, uncovered, velocity_left
+from calib.bench.evidence import Attempt, ResidualVelocity, Result, residual_velocity, uncovered
 from calib.bench.journal import Entry
-from calib.bench.keys import Keys
-from calib.bench.queue_sink import Tap
-from calib.bench.screen import Screen, with_port_state
+from calib.bench.keys import Keyboard
+from calib.bench.queue_sink import QueueSink
+from calib.bench.screen import OperatorScreen, with_port_state
 from calib.bench.session import REPORT, RESULT, Session
 from calib.certificate import write
 from calib.lever_arms.gauge import convert
@@ -42,7 +42,7 @@ from calib.reports.identification import arms_text, report_html, verdict
 from imudrv.calibration import Calibration, read_calibration, write_calibration
 from imudrv.errors import InputError
 from imudrv.files import atomic
-from imudrv.files.atomic import replacing
+from imudrv.files.atomic import atomic_write
 from imudrv.records import INCREMENTS, Records
 from imudrv.service.loop import Service
 from imudrv.sinks.base import Batch
@@ -64,7 +64,7 @@ class _StoppedError(Exception):
     """The service has ended before the session."""
 
 
-class Conduct:
+class SessionController:
     """The worker: leads a session to its end, or as far as it gets.
 
     Parameters
@@ -100,9 +100,9 @@ class Conduct:
         procedure: Procedure,
         layout: Layout,
         service: Service,
-        tap: Tap,
-        screen: Screen,
-        keys: Keys,
+        tap: QueueSink,
+        screen: OperatorScreen,
+        keys: Keyboard,
         *,
         hands_free: bool,
         begin: Callable[[Procedure], None],
@@ -330,7 +330,7 @@ class Conduct:
         if lacks:
             return f"{lacks}: this computer, or its disk, was held up for too long"
         log = next(log for log in reversed(engine.runs) if log.step_id == event.step_id)
-        with replacing(session.folder / f"{name}.npz") as archive:
+        with atomic_write(session.folder / f"{name}.npz") as archive:
             np.savez(archive, **{f.name: getattr(log, f.name) for f in fields(log)})
         session.enter(f"{name}.npz")
         degc = dict(self._conditions.temperature_degc)
@@ -377,18 +377,18 @@ class Conduct:
                 f"it stays so, the result is in {session.folder / RESULT}"
             )
 
-    def _left(self, certificate: Calibration) -> Left:
+    def _left(self, certificate: Calibration) -> ResidualVelocity:
         """Velocity left by the verification rotation."""
         session, procedure = self._session, verification(self._procedure)
         attempt = session.attempt_at(procedure.steps[0])
-        return velocity_left(procedure, attempt, certificate, session.site())
+        return residual_velocity(procedure, attempt, certificate, session.site())
 
-    def _write_report(self, result: Result, left: Left | None) -> None:
+    def _write_report(self, result: Result, left: ResidualVelocity | None) -> None:
         findings = result.findings
         html = report_html(findings, (findings.arms, convert(findings.arms, "x")))
         words = "was skipped" if left is None else f"with the new certificate: {left}"
         section = f"<section>\n<h2>Verification</h2>\n<p>One more rotation {words}.</p>\n</section>"
-        with replacing(self._session.folder / REPORT) as file:
+        with atomic_write(self._session.folder / REPORT) as file:
             file.write(html.replace("</section>", f"</section>\n{section}", 1).encode())  # behind the result
         self._session.enter(REPORT)
 

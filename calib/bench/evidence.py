@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from calib.certificate import certificate, software
 from calib.detection.blocks import BLOCK_NS
-from calib.estimation.joint import joint
-from calib.estimation.runs import Evidence, Priors, Run, collect
-from calib.identification import Basis, Findings, Source, Temperature
+from calib.estimation.joint import estimate_joint
+from calib.estimation.runs import CaptureRuns, Priors, Run, navigate_rotations
+from calib.identification import CaptureSummary, IdentificationResult, PriorCalibration, Temperature
 from calib.procedure.schema import Procedure, Step
 from imudrv.calibration import Calibration, coefficients
 from imudrv.errors import InputError
@@ -79,11 +79,11 @@ class Result(NamedTuple):
         The unit's new one.
     """
 
-    findings: Findings
+    findings: IdentificationResult
     certificate: Calibration
 
 
-class Left(NamedTuple):
+class ResidualVelocity(NamedTuple):
     """Horizontal velocity that a rotation left, m/s.
 
     Attributes
@@ -103,7 +103,7 @@ class Left(NamedTuple):
         )
 
 
-class _Heard(NamedTuple):
+class _DecodedRecording(NamedTuple):
     """What a recording holds of an attempt."""
 
     pulses: Records  # of the evidence
@@ -112,7 +112,9 @@ class _Heard(NamedTuple):
     counts: SampleCounts  # of the whole recording
 
 
-def identify(procedure: Procedure, attempts: Sequence[Attempt], basis: Basis, site: Site) -> Result:
+def identify(
+    procedure: Procedure, attempts: Sequence[Attempt], basis: PriorCalibration, site: Site
+) -> Result:
     """Find the lever arms.
 
     Parameters
@@ -133,13 +135,13 @@ def identify(procedure: Procedure, attempts: Sequence[Attempt], basis: Basis, si
     Raises
     ------
     InputError
-        A recording cannot be read or lacks its rotation, or `joint` refuses.
+        A recording cannot be read or lacks its rotation, or `estimate_joint` refuses.
     """
     priors = Priors()
     known = replace(coefficients(basis.calibration), r_b=None)
     sources = tuple(_source(procedure, attempt, known, site, priors) for attempt in attempts)
-    findings = Findings(
-        joint([run for source in sources for run in source.evidence.runs], priors),
+    findings = IdentificationResult(
+        estimate_joint([run for source in sources for run in source.evidence.runs], priors),
         basis,
         site,
         procedure.rotation_limits(procedure.steps[0]),
@@ -188,7 +190,9 @@ def require_covered(attempt: Attempt) -> None:
     _hear(attempt)
 
 
-def velocity_left(procedure: Procedure, attempt: Attempt, calibration: Calibration, site: Site) -> Left:
+def residual_velocity(
+    procedure: Procedure, attempt: Attempt, calibration: Calibration, site: Site
+) -> ResidualVelocity:
     """Tell what compensation does for a rotation.
 
     Parameters
@@ -218,7 +222,7 @@ def velocity_left(procedure: Procedure, attempt: Attempt, calibration: Calibrati
         run = _collected(procedure, attempt, heard, c, site, Priors()).runs[0]
         gained = _mean(run, run.after, slice(rows)) - _mean(run, run.before, slice(-rows, None))
         left.append(float(np.hypot(gained[0], gained[1])))
-    return Left(*left)
+    return ResidualVelocity(*left)
 
 
 def _mean(run: Run, rest: np.ndarray, rows: slice) -> np.ndarray:
@@ -228,12 +232,12 @@ def _mean(run: Run, rest: np.ndarray, rows: slice) -> np.ndarray:
 
 def _source(
     procedure: Procedure, attempt: Attempt, known: Coefficients, site: Site, priors: Priors
-) -> Source:
+) -> CaptureSummary:
     with atomic.unchanged(attempt.recording):
         heard = _hear(attempt)
         digest = atomic.sha256(attempt.recording)
     degc = heard.pulses["temperature_degc"]
-    return Source(
+    return CaptureSummary(
         attempt.recording.stem,
         attempt.recording.name,
         digest,
@@ -249,12 +253,17 @@ def _source(
 
 
 def _collected(
-    procedure: Procedure, attempt: Attempt, heard: _Heard, known: Coefficients, site: Site, priors: Priors
-) -> Evidence:
+    procedure: Procedure,
+    attempt: Attempt,
+    heard: _DecodedRecording,
+    known: Coefficients,
+    site: Site,
+    priors: Priors,
+) -> CaptureRuns:
     layout = heard.layout
     compensator = Compensator(known, layout, rate_filter("causal", layout.interval_ns))
     increments = [compensator.feed(heard.pulses), compensator.close()]
-    evidence = collect(
+    evidence = navigate_rotations(
         lambda: increments,
         known.C_ba,
         site,
@@ -272,7 +281,7 @@ def _collected(
     return evidence
 
 
-def _hear(attempt: Attempt) -> _Heard:
+def _hear(attempt: Attempt) -> _DecodedRecording:
     """Decode a recording and cut it to the evidence, all of which has to be there."""
     heard = _decoded(attempt)
     if lacks := _lacks(attempt, heard):
@@ -284,7 +293,7 @@ def _hear(attempt: Attempt) -> _Heard:
     return heard
 
 
-def _decoded(attempt: Attempt) -> _Heard:
+def _decoded(attempt: Attempt) -> _DecodedRecording:
     """Decode a recording and cut it to what there is of the evidence."""
     recording = Recording(attempt.recording)
     layout = recording.profile.layout()
@@ -299,7 +308,7 @@ def _decoded(attempt: Attempt) -> _Heard:
     if len(counter) and not begin:  # at a restart the service, too, begins with the unit's own number
         counter = counter + _offset(recording, attempt, int(counter[0]), 1 << layout.counter_bits)
     first, stop = np.searchsorted(counter, [attempt.first_counter, attempt.last_counter + 1])
-    return _Heard(heard[begin + first : begin + stop], counter[first:stop], layout, tracker.counts)
+    return _DecodedRecording(heard[begin + first : begin + stop], counter[first:stop], layout, tracker.counts)
 
 
 def _offset(recording: Recording, attempt: Attempt, first: int, period: int) -> int:
@@ -314,7 +323,7 @@ def _multiple(difference: int, period: int) -> int:
     return (2 * difference + period) // (2 * period) * period
 
 
-def _lacks(attempt: Attempt, heard: _Heard) -> str:
+def _lacks(attempt: Attempt, heard: _DecodedRecording) -> str:
     """Name the longest gap in the evidence, unless the line lost these samples.
 
     Where their number is not known, gaps of up to a block of 20 ms are taken for losses of the line: the

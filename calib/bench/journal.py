@@ -30,7 +30,7 @@ _HASH: Final = ', "sha256": "'
 _HASH_BYTES: Final = len(_HASH) + 64 + len('"}')
 
 
-class Torn(NamedTuple):
+class PartialLine(NamedTuple):
     """The beginning of a line at a journal's very end.
 
     Attributes
@@ -69,7 +69,7 @@ class Contents(NamedTuple):
 
     entries: list[Entry]
     last: str
-    torn: Torn | None
+    torn: PartialLine | None
 
 
 class Journal:
@@ -214,7 +214,7 @@ def read(path: Path) -> Contents:
             last = hash_of_mended
             at, number = at + len(line) + len(mend), number + 2
         elif mend.startswith(rest) and not _is_json(line):
-            torn = Torn(number, line, mend[len(rest) :])
+            torn = PartialLine(number, line, mend[len(rest) :])
         else:
             raise InputError(f"{path}: line {number}: is damaged: its text does not give its sha256")
     if not entries:

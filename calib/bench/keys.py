@@ -17,7 +17,7 @@ _ACTIONS: Final = {"\n": "confirm", "\r": "confirm", "r": "redo", "s": "skip", "
 _BY_STEP: Final[dict[str, Callable[[str], Action]]] = {"confirm": Confirm, "redo": Redo, "skip": Skip}
 
 
-class Keys:
+class Keyboard:
     """Keys, and what they ask for; Ctrl-C stays the system's.
 
     Where standard input is no terminal there are none.

@@ -6,7 +6,7 @@ from queue import SimpleQueue
 from imudrv.sinks.base import Batch, Sink, SinkState
 
 
-class Tap(Sink):
+class QueueSink(Sink):
     """Way from the service's loop to the worker.
 
     Parameters

@@ -10,12 +10,12 @@ from typing import Final
 
 from rich.console import Console
 
-from calib.bench.controller import Conduct
-from calib.bench.keys import Keys
-from calib.bench.queue_sink import Tap
-from calib.bench.screen import Screen
-from calib.bench.session import JOURNAL, REPORT, WORKING, Document, Session
-from calib.bench.simulated_unit import Rehearsal
+from calib.bench.controller import SessionController
+from calib.bench.keys import Keyboard
+from calib.bench.queue_sink import QueueSink
+from calib.bench.screen import OperatorScreen
+from calib.bench.session import JOURNAL, REPORT, WORKING_CERTIFICATE, EmbeddedFile, Session
+from calib.bench.simulated_unit import SimulatedUnitProcess
 from calib.procedure.plan import load_file, predicted
 from calib.procedure.schema import Procedure
 from imudrv import profiles
@@ -90,13 +90,13 @@ def run(
     """
     folder = folder or Path(f"session-{datetime.now(UTC):%Y%m%dT%H%M%SZ}")
     is_there = (folder / JOURNAL).exists()
-    keys = Keys()
-    rehearsal = Rehearsal(folder, speed) if rehearse or Rehearsal.was(folder) else None
+    keys = Keyboard()
+    rehearsal = SimulatedUnitProcess(folder, speed) if rehearse or SimulatedUnitProcess.was(folder) else None
     if rehearsal is None and not hands_free and not keys.there:
         raise InputError("expected a terminal for the operator's keys, got none; use one, or --hands-free")
     if rehearsal is not None and (port or calibration or site):
         raise InputError("--rehearse: expected no --port, --calibration or --site; it has a unit of its own")
-    if is_there and rehearse and not Rehearsal.was(folder):
+    if is_there and rehearse and not SimulatedUnitProcess.was(folder):
         raise InputError(f"{folder}: expected a rehearsal to go on with, got the session of a unit")
     if redo and not is_there:
         raise InputError(f"--redo: expected a session that is there, with --session, got none in {folder}")
@@ -133,18 +133,18 @@ def run(
 def _conducted(
     session: Session,
     port: str,
-    keys: Keys,
-    rehearsal: Rehearsal | None,
+    keys: Keyboard,
+    rehearsal: SimulatedUnitProcess | None,
     hands_free: bool,
     console: Console,
 ) -> int:
     plan = session.plan
     layout = profiles.load(plan.profile.name).layout()
-    tap = Tap(AHEAD if rehearsal is not None and rehearsal.waits else None)
+    tap = QueueSink(AHEAD if rehearsal is not None and rehearsal.waits else None)
     settings = Settings(
         port=port,
         profile=plan.profile.name,
-        calibration=str(session.folder / WORKING),
+        calibration=str(session.folder / WORKING_CERTIFICATE),
         unit=plan.unit,
         status=str(Path(tempfile.gettempdir()) / f"imu50-calib-{os.getpid()}.sock"),
     )
@@ -160,13 +160,13 @@ def _conducted(
         if rehearsal is not None:
             rehearsal.begin(steps, plan.profile.name)
 
-    conduct = Conduct(
+    conduct = SessionController(
         session,
         session.procedure(),
         layout,
         service,
         tap,
-        Screen(console),
+        OperatorScreen(console),
         keys,
         hands_free=hands_free or rehearsal is not None,
         begin=begin,
@@ -218,5 +218,5 @@ def _resume(session: Session, console: Console, redo: Sequence[str], asks: bool)
     session.append({"event": "resumed", "left": left})
 
 
-def _document(name: str | Path, content: bytes) -> Document:
-    return Document(str(name), content.decode())
+def _document(name: str | Path, content: bytes) -> EmbeddedFile:
+    return EmbeddedFile(str(name), content.decode())

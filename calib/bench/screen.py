@@ -124,7 +124,7 @@ def plain(view: View, question: str = "") -> str:
     return " | ".join(part for part in parts if part)
 
 
-class Screen:
+class OperatorScreen:
     """Where views are shown.
 
     A thread of its own writes, so that nobody waits for a terminal that is stopped (Ctrl-S) or for a slow

@@ -26,7 +26,7 @@ import numpy as np
 from calib.bench import journal
 from calib.bench.evidence import Attempt, Result, identify, require_covered
 from calib.bench.journal import Entry, Journal
-from calib.identification import Basis
+from calib.identification import PriorCalibration
 from calib.procedure.plan import verification
 from calib.procedure.schema import VERIFICATION, Procedure, Step
 from imudrv import profiles
@@ -38,10 +38,10 @@ from imudrv.site import Site
 JOURNAL: Final = "journal.jsonl"
 
 
-BEFORE: Final = "before.yaml"
+INITIAL_CERTIFICATE: Final = "before.yaml"
 
 
-WORKING: Final = "working.yaml"
+WORKING_CERTIFICATE: Final = "working.yaml"
 
 
 RESULT: Final = "certificate.yaml"
@@ -57,7 +57,7 @@ RESUME_KELVIN: Final = 5.0
 LOCK: Final = ".lock"
 
 
-class Document(NamedTuple):
+class EmbeddedFile(NamedTuple):
     """A file that the plan holds, whole.
 
     Attributes
@@ -94,9 +94,9 @@ class Plan(NamedTuple):
         Where the unit was connected.
     """
 
-    procedure: Document
-    site: Document
-    profile: Document
+    procedure: EmbeddedFile
+    site: EmbeddedFile
+    profile: EmbeddedFile
     certificate: Path
     certificate_sha256: str
     unit: str
@@ -122,7 +122,7 @@ class Session:
         self._journal = Journal(folder / JOURNAL)
         self.plan = plan_of(self._journal.entries[0], folder)
         self.dropped = self._journal.dropped
-        for name in (BEFORE, WORKING):
+        for name in (INITIAL_CERTIFICATE, WORKING_CERTIFICATE):
             if name not in self.files:
                 self.enter(name)
 
@@ -131,9 +131,9 @@ class Session:
         cls,
         folder: Path,
         *,
-        procedure: Document,
+        procedure: EmbeddedFile,
         calibration: Path,
-        site: Document,
+        site: EmbeddedFile,
         profile: str,
         port: str,
     ) -> Self:
@@ -178,7 +178,7 @@ class Session:
         documents = {
             "procedure": procedure,
             "site": site,
-            "profile": Document(profile, profiles.content(profile).decode()),
+            "profile": EmbeddedFile(profile, profiles.content(profile).decode()),
         }
         for name, document in documents.items():
             plan[name] = {**document._asdict(), "sha256": document.sha256}
@@ -192,8 +192,8 @@ class Session:
                 raise InputError(
                     f"{folder}: expected a new folder, there is a session in it; resume it, or name another"
                 )
-            (folder / BEFORE).write_bytes(content)
-            write_calibration(folder / WORKING, before.model_copy(update={"size_effect": None}))
+            (folder / INITIAL_CERTIFICATE).write_bytes(content)
+            write_calibration(folder / WORKING_CERTIFICATE, before.model_copy(update={"size_effect": None}))
             journal.begin(folder / JOURNAL, plan)
             return cls(folder, lock)
         except BaseException:
@@ -363,9 +363,9 @@ class Session:
     def require_same(
         self,
         *,
-        procedure: Document | None = None,
+        procedure: EmbeddedFile | None = None,
         calibration: Path | None = None,
-        site: Document | None = None,
+        site: EmbeddedFile | None = None,
         profile: str | None = None,
     ) -> None:
         """Refuse to resume with anything else than the session began with.
@@ -392,9 +392,9 @@ class Session:
             )
         given = {"procedure": procedure, "site": site}
         if profile is not None:
-            given["profile"] = Document(profile, profiles.content(profile).decode())
+            given["profile"] = EmbeddedFile(profile, profiles.content(profile).decode())
         for name, document in given.items():
-            began: Document = getattr(plan, name)
+            began: EmbeddedFile = getattr(plan, name)
             if document is not None and document.sha256 != began.sha256:
                 differ.append(
                     f"{name}: expected {began.name} as it was, got {document.name} with other contents"
@@ -438,7 +438,7 @@ class Session:
 
     def calibration(self) -> Calibration:
         """The certificate that the service works with."""
-        return read_calibration(self.folder / WORKING)
+        return read_calibration(self.folder / WORKING_CERTIFICATE)
 
     def site(self) -> Site:
         """Where the unit stands."""
@@ -525,7 +525,8 @@ def plan_of(entry: Entry, folder: Path) -> Plan:
     if entry.get("format") != "imu50-session" or entry.get("version") != 1:
         raise InputError(f"{folder / JOURNAL}: line 1: expected the plan of an imu50-session, version 1")
     documents = {
-        name: Document(entry[name]["name"], entry[name]["text"]) for name in ("procedure", "site", "profile")
+        name: EmbeddedFile(entry[name]["name"], entry[name]["text"])
+        for name in ("procedure", "site", "profile")
     }
     return Plan(
         **documents,
@@ -540,7 +541,9 @@ def identified(folder: Path, plan: Plan, entries: Sequence[Entry]) -> Result:
     """Estimate the lever arms from the accepted recordings."""
     procedure = _procedure(plan)
     accepted = _accepted(entries)
-    basis = Basis(read_calibration(folder / BEFORE), plan.certificate.name, plan.certificate_sha256)
+    basis = PriorCalibration(
+        read_calibration(folder / INITIAL_CERTIFICATE), plan.certificate.name, plan.certificate_sha256
+    )
     attempts = [_attempt(folder, step, accepted[step.id]) for step in procedure.steps if step.id in accepted]
     return identify(procedure, attempts, basis, _site(plan))
 

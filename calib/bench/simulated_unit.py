@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import Final
 
-from calib.bench.technician import BENCH, technician
+from calib.bench.technician import BENCH, technician_scenario
 from calib.procedure.schema import Procedure
 from imudrv.calibration import write_calibration
 from imudrv.errors import InputError
@@ -30,7 +30,7 @@ _UNIT: Final = (
 )
 
 
-class Rehearsal:
+class SimulatedUnitProcess:
     """A simulated unit in the hands of a simulated technician, in a process of its own, on a pty.
 
     Parameters
@@ -75,7 +75,7 @@ class Rehearsal:
             Where it stands.
         """
         self._folder.mkdir(parents=True, exist_ok=True)
-        unit = technician(procedure, seed=SEED).unit.calibration
+        unit = technician_scenario(procedure, seed=SEED).unit.calibration
         assert unit is not None
         certificate, site = self._folder / "unit.yaml", self._folder / "site.yaml"
         write_calibration(certificate, unit.model_copy(update={"size_effect": None}))
@@ -99,7 +99,7 @@ class Rehearsal:
         """
         self.end()
         scenario = self._folder / "scenario.yaml"
-        settings_file.write(scenario, technician(procedure, seed=SEED))
+        settings_file.write(scenario, technician_scenario(procedure, seed=SEED))
         command = ["sim", str(scenario), "--profile", profile, "--port", "pty", "--link", str(self._link)]
         self._unit = subprocess.Popen(
             [sys.executable, "-c", _UNIT, str(os.getpid()), *command, "--speed", self._speed],

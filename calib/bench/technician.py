@@ -76,7 +76,7 @@ class Mistake:
     kind: Kind
 
 
-def technician(
+def technician_scenario(
     procedure: Procedure,
     mistakes: Sequence[Mistake] = (),
     *,
@@ -118,7 +118,7 @@ def technician(
         )
     rng = np.random.default_rng(seed)
     calibration = calibration or _drawn(rng)
-    hands = _Hands(procedure, rng)
+    hands = _MotionScript(procedure, rng)
     for step in procedure.steps:
         hands.do(step, kinds.get(step.id))
     hands.rest(REACTION_S)
@@ -154,7 +154,7 @@ def _drawn(rng: np.random.Generator) -> Calibration:
     return NOMINAL.model_copy(update={"serial_number": "rehearsal", "size_effect": size_effect})
 
 
-class _Hands:
+class _MotionScript:
     """The technician's hands: what they do becomes the motion."""
 
     def __init__(self, procedure: Procedure, rng: np.random.Generator) -> None:

@@ -18,7 +18,7 @@ from calib.bench.session import (
     require_session,
     uncovered_steps,
 )
-from calib.certificate import FOUND
+from calib.certificate import PROVENANCE_IDENTIFIED
 from imudrv.calibration import Calibration, read_calibration
 from imudrv.errors import InputError
 from imudrv.units import MM
@@ -91,7 +91,7 @@ def verify(folder: Path) -> Verified:
 def _timeless(calibration: Calibration) -> Entry:
     """A certificate without when, and by which version, it was computed."""
     document = calibration.model_dump(mode="json", exclude={"created"})
-    document["provenance"][FOUND].pop("software", None)
+    document["provenance"][PROVENANCE_IDENTIFIED].pop("software", None)
     return document
 
 

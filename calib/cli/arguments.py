@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Final, Literal, TypeAlias, get_args
 
 from calib.estimation.result import Extra
-from calib.lever_arms.gauge import Arms
+from calib.lever_arms.gauge import LeverArms
 from imudrv.calibration import Calibration
 from imudrv.errors import InputError
 from imudrv.files.outputs import file_to_write, require_other
@@ -28,7 +28,7 @@ EXTRAS: Final[tuple[Extra, ...]] = get_args(Extra)
 PROGRAMS: Final = ("kalibr", "psins")
 
 
-def written_text(path: Path, calibration: Calibration, arms: Arms) -> str:
+def written_text(path: Path, calibration: Calibration, arms: LeverArms) -> str:
     """Return the line that reports a written certificate."""
     return f"{path}: certificate of unit {calibration.serial_number}, gauge {arms.gauge}"
 

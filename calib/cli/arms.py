@@ -9,7 +9,13 @@ from typing import Any
 import yaml
 from pydantic import ConfigDict, JsonValue
 
-from calib.certificate import CHANGED, FOUND, arms_of, with_arms, write
+from calib.certificate import (
+    PROVENANCE_CONVERTED,
+    PROVENANCE_IDENTIFIED,
+    lever_arms_of,
+    with_lever_arms,
+    write,
+)
 from calib.cli.arguments import check_output, known_point, written_text
 from calib.lever_arms.gauge import convert
 from calib.lever_arms.interchange import from_kalibr, from_psins, to_kalibr, to_psins
@@ -25,7 +31,7 @@ def run_gauge(arguments: argparse.Namespace) -> None:
     """Convert the gauge of a certificate."""
     check_output(arguments.output, arguments.file)
     file = read_calibration_file(arguments.file)
-    before = arms_of(file.model, str(arguments.file))
+    before = lever_arms_of(file.model, str(arguments.file))
     stated = known_point(arguments.at)
     arms = convert(before, arguments.gauge, stated)
     how: dict[str, Any] = {
@@ -35,14 +41,14 @@ def run_gauge(arguments: argparse.Namespace) -> None:
     }
     if stated is not None:
         how["stated_mm"] = {stated[0]: [value / MM for value in stated[1]]}
-    write(arguments.output, with_arms(file.model, arms, CHANGED, how))
+    write(arguments.output, with_lever_arms(file.model, arms, PROVENANCE_CONVERTED, how))
     print(arms_text(arms), end="")
     print(written_text(arguments.output, file.model, arms))
 
 
 def run_export(arguments: argparse.Namespace) -> None:
     """Export lever arms."""
-    arms = arms_of(read_calibration(arguments.file), str(arguments.file))
+    arms = lever_arms_of(read_calibration(arguments.file), str(arguments.file))
     if arguments.to == "kalibr":
         print("# lever arms of the accelerometers, m, origin at that of x")
         print(yaml.safe_dump({"imu0": to_kalibr(arms)}, sort_keys=False, default_flow_style=None), end="")
@@ -63,7 +69,7 @@ def run_import(arguments: argparse.Namespace) -> None:
         content = atomic.content(arguments.file)
         arms, digest = from_psins(_clbt(content, arguments.file)), sha256(content).hexdigest()
     how = {"method": f"imported from {arguments.program}", "file_sha256": digest}
-    write(arguments.output, with_arms(calibration, arms, FOUND, how))
+    write(arguments.output, with_lever_arms(calibration, arms, PROVENANCE_IDENTIFIED, how))
     print(arms_text(arms), end="")
     print(written_text(arguments.output, calibration, arms))
 

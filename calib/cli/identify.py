@@ -8,15 +8,15 @@ from rich.console import Console
 
 from calib.certificate import certificate, check_target, write
 from calib.cli.arguments import Stated, check_output, known_point, written_text
-from calib.identification import Basis, find
-from calib.lever_arms.gauge import Arms, Gauge, convert
+from calib.identification import PriorCalibration, identify_captures
+from calib.lever_arms.gauge import Gauge, LeverArms, convert
 from calib.reports.identification import report_for_terminal, report_html, report_text
 from calib.result_file import result_document, write_json
 from imudrv import profiles
 from imudrv.calibration import Calibration, read_calibration_file
 from imudrv.errors import InputError
 from imudrv.files import settings_file
-from imudrv.files.atomic import replacing
+from imudrv.files.atomic import atomic_write
 from imudrv.recording.reader import Recording
 from imudrv.site import Site
 from imudrv.terminal import progress
@@ -34,7 +34,7 @@ def run_identify(arguments: argparse.Namespace) -> None:
     profile = profiles.load(arguments.profile) if arguments.profile else None
     size = sum(path.stat().st_size for path in arguments.captures if path.exists())
     with progress("identify", 2 * size) as advance:  # each capture is read twice
-        findings = find(
+        findings = identify_captures(
             arguments.captures,
             profile,
             basis,
@@ -54,7 +54,7 @@ def run_identify(arguments: argparse.Namespace) -> None:
             write_json(arguments.json, result_document(findings, arms))
             written.append(f"{arguments.json}: the result")
         if arguments.report is not None:
-            with replacing(arguments.report) as file:
+            with atomic_write(arguments.report) as file:
                 file.write(report_html(findings, told).encode())
             written.append(f"{arguments.report}: the report")
         write(arguments.output, certificate(findings, arms))
@@ -68,7 +68,7 @@ def run_identify(arguments: argparse.Namespace) -> None:
         print(*written, sep="\n")
 
 
-def _wanted(arms: Arms, gauge: Gauge | None, stated: Stated | None) -> Arms:
+def _wanted(arms: LeverArms, gauge: Gauge | None, stated: Stated | None) -> LeverArms:
     """The arms in the gauge asked for; nobody asked: in that of the estimate."""
     if stated is None and gauge in (None, arms.gauge):
         return arms
@@ -77,11 +77,11 @@ def _wanted(arms: Arms, gauge: Gauge | None, stated: Stated | None) -> Arms:
     return convert(arms, gauge, stated)
 
 
-def _basis(arguments: argparse.Namespace) -> Basis:
+def _basis(arguments: argparse.Namespace) -> PriorCalibration:
     """The calibration given, or the one that the recordings agree on."""
     if arguments.calibration is not None:
         file = read_calibration_file(arguments.calibration, arguments.unit)
-        return Basis(file.model, arguments.calibration.name, file.sha256)
+        return PriorCalibration(file.model, arguments.calibration.name, file.sha256)
     texts: dict[str, str] = {}
     for path in arguments.captures:
         text = Recording(path).calibration_text if path.suffix == ".mcap" else None
@@ -100,4 +100,6 @@ def _basis(arguments: argparse.Namespace) -> Basis:
             f"{path}: expected a recording of unit {arguments.unit!r}, "
             f"got one of {calibration.serial_number!r}"
         )
-    return Basis(calibration, f"calibration in {Path(path).name}", sha256(text.encode()).hexdigest())
+    return PriorCalibration(
+        calibration, f"calibration in {Path(path).name}", sha256(text.encode()).hexdigest()
+    )

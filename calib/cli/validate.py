@@ -7,21 +7,21 @@ from typing import Final
 
 from rich.console import Console
 
-from calib.certificate import arms_of
+from calib.certificate import lever_arms_of
 from calib.cli.arguments import check_output
 from calib.reports.html import as_html
 from calib.reports.text import as_text, for_terminal
 from calib.reports.validation import document
 from calib.validation.navigate import navigate
-from calib.validation.simulate import TRIALS, askew, campaign, dithering
-from calib.validation.trial import Setting, Trial
-from calib.validation.verdict import Judged, judge
+from calib.validation.simulate import TRIALS, campaign, dither_trials, skew_trials
+from calib.validation.trial import Trial, TrialSettings
+from calib.validation.verdict import TrialMetrics, evaluate
 from imudrv import profiles
 from imudrv.calibration import Calibration, read_calibration
 from imudrv.capture import Capture
 from imudrv.errors import InputError
 from imudrv.files import settings_file
-from imudrv.files.atomic import replacing
+from imudrv.files.atomic import atomic_write
 from imudrv.site import Site
 from imudrv.terminal import OK, progress
 
@@ -37,7 +37,7 @@ def run_validate(arguments: argparse.Namespace) -> int:
         inputs = (*arguments.recordings, arguments.profile, arguments.calibration, arguments.site)
         check_output(arguments.report, *inputs)
     if arguments.simulate is not None:
-        trials = [(trial, judge(trial)) for trial in _simulated(arguments)]
+        trials = [(trial, evaluate(trial)) for trial in _simulated(arguments)]
         shown = sum(trial.name.endswith("unit 1") for trial, _ in trials)
         told = document("a simulated unit", trials, shown)
         required = [judged for trial, judged in trials if "unit" in trial.name]
@@ -46,7 +46,7 @@ def run_validate(arguments: argparse.Namespace) -> int:
         told = document(f"unit {calibration.serial_number}", trials, len(trials))
         required = [judged for _, judged in trials]
     if arguments.report is not None:
-        with replacing(arguments.report) as file:
+        with atomic_write(arguments.report) as file:
             file.write(as_html(told).encode())
     console = Console(highlight=False)
     if console.is_terminal:
@@ -65,21 +65,21 @@ def _simulated(arguments: argparse.Namespace) -> Iterator[Trial]:
     with console.status("simulate") if console.is_terminal else nullcontext() as status:
         yield from campaign(names, range(1, seeds + 1), name, status.update if status else lambda _: None)
         if which == "all":
-            yield from askew(1)
-            yield from dithering(1)
+            yield from skew_trials(1)
+            yield from dither_trials(1)
 
 
-def _navigated(arguments: argparse.Namespace) -> tuple[Calibration, list[tuple[Trial, Judged]]]:
+def _navigated(arguments: argparse.Namespace) -> tuple[Calibration, list[tuple[Trial, TrialMetrics]]]:
     if arguments.calibration is None or arguments.site is None:
         raise InputError("validate: expected --calibration and --site with recordings")
     calibration = read_calibration(arguments.calibration)
-    arms_of(calibration, str(arguments.calibration))
+    lever_arms_of(calibration, str(arguments.calibration))
     site = settings_file.read(arguments.site, Site)
     profile = profiles.load(arguments.profile) if arguments.profile else None
     found = []
     for path in arguments.recordings:
         capture = Capture(path, profile, arguments.channel)
-        setting = Setting(
+        setting = TrialSettings(
             capture.layout,
             calibration,
             site,
@@ -89,5 +89,5 @@ def _navigated(arguments: argparse.Namespace) -> tuple[Calibration, list[tuple[T
         )
         with progress(path.name, capture.size) as advance:
             trial = navigate(path.name, capture.pulses(advance), setting)
-        found.append((trial, judge(trial)))
+        found.append((trial, evaluate(trial)))
     return calibration, found

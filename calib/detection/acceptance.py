@@ -13,7 +13,7 @@ LEAST_EXTRAPOLATED_DEG_PER_S: Final = 10.0
 
 
 @dataclass(frozen=True)
-class Limits:
+class RotationLimits:
     """What a rotation of the procedure has to keep; degrees and seconds.
 
     Attributes
@@ -39,7 +39,9 @@ class Limits:
     missing: int = 0
 
 
-def judge(rotation: Rotation, limits: Limits, expected: str | None = None) -> tuple[str, ...]:
+def rejection_reasons(
+    rotation: Rotation, limits: RotationLimits, expected: str | None = None
+) -> tuple[str, ...]:
     """Why a motion cannot serve as a rotation of the procedure.
 
     Parameters

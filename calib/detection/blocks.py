@@ -24,7 +24,7 @@ class Block(NamedTuple):
     restarted: bool  # the counter began anew
 
 
-class Cutter:
+class BlockSplitter:
     """Cuts samples into blocks that the counter bounds, however they come in."""
 
     def __init__(self, interval_ns: int) -> None:

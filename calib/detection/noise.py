@@ -45,7 +45,7 @@ class Noise:
 
 
 @dataclass(frozen=True)
-class Differences:
+class SecondDifferences:
     """Second differences of the sums of angle and velocity, from which noise is told.
 
     Of means over w = `BIN_S`; white noise s and a random walk q in them have, over a lag L >= w, the variance
@@ -67,7 +67,7 @@ class Differences:
     single: float
 
 
-def pooled_noise(rests: Iterable[Differences | None]) -> Noise:
+def pooled_noise(rests: Iterable[SecondDifferences | None]) -> Noise:
     """Noise that explains several rests together.
 
     Parameters

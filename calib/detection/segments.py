@@ -22,7 +22,15 @@ from numpy.typing import NDArray
 
 from calib.axes import axis_name
 from calib.detection.blocks import BLOCK, BLOCK_NS, join_blocks
-from calib.detection.noise import BIN_S, LAGS, LEAST_NOISE_S, Differences, Noise, mean_squares, pooled_noise
+from calib.detection.noise import (
+    BIN_S,
+    LAGS,
+    LEAST_NOISE_S,
+    Noise,
+    SecondDifferences,
+    mean_squares,
+    pooled_noise,
+)
 from imudrv.arrays import Array
 from imudrv.errors import InputError
 from imudrv.nav.attitude import conjugate, product, quaternion_of_vector, turn, unit
@@ -71,7 +79,7 @@ class Rest:
     up: str
     up_b: Array
     f_b: Array
-    differences: Differences | None
+    differences: SecondDifferences | None
     missing: int
 
     @property
@@ -338,7 +346,7 @@ class _Found:
             missing=self._missing(begin, stop),
         )
 
-    def _differences(self, part: slice, f_b: Array) -> Differences | None:
+    def _differences(self, part: slice, f_b: Array) -> SecondDifferences | None:
         w = round(BIN_S / (self.size * self.interval_s))
         level = np.arange(3) != int(np.argmax(np.abs(f_b)))
         angle = self._means(part, "dtheta_b", "angle")
@@ -348,7 +356,7 @@ class _Found:
             return None
         single = np.diff(np.cumsum(self.blocks["dv_b"][part][:, level], axis=0), 2, axis=0)
         angle, velocity = (x[: n * w].reshape(n, w, -1).mean(axis=1) for x in (angle, velocity))
-        return Differences(
+        return SecondDifferences(
             np.array([max(0, n - 2 * k) for k in LAGS], np.float64),
             mean_squares(angle),
             mean_squares(velocity),

@@ -26,7 +26,7 @@ MG: Final = 1e-3 * STANDARD_GRAVITY
 """One milli-g, m/s^2."""
 
 
-class Stillness:
+class StillnessDetector:
     """Whether the unit stands still, by the rule of `calib.detection.segments`, as the samples come."""
 
     def __init__(self, rate_limit: float, force_limit: float) -> None:
@@ -75,7 +75,7 @@ class Stillness:
         return f"specific force {self._off * mg:.1f} mg off its mean, limit {mg:.1f}"
 
 
-class Means:
+class RestAverages:
     """Mean readings of a rest, and their noise."""
 
     def __init__(self) -> None:
@@ -118,7 +118,7 @@ class Means:
         return rate, force
 
 
-class Posture:
+class AttitudeTracker:
     """How the unit lies: gravity, and once an alignment has told it, attitude, carried on by the gyros.
 
     Parameters
@@ -167,7 +167,7 @@ def _vector(v: Array) -> Vector:
     return x, y, z
 
 
-class Turn:
+class RotationTracker:
     """A turn as it happens."""
 
     def __init__(self, up_b: Vector = (0.0, 0.0, 1.0)) -> None:

@@ -142,7 +142,7 @@ def _each_gyro(*values: ArrayLike) -> Iterator[Array]:
 
 
 @dataclass(frozen=True)
-class Lines:
+class LineSpectrum:
     """A specific force along each accelerometer as a sum of lines: Re sum c exp(2 pi i f t).
 
     Parameters
@@ -177,11 +177,11 @@ class Lines:
         force: Array = np.real(np.exp(2j * np.pi * turns) @ self.phasor).astype(np.float64)
         return force
 
-    def averaged(self, interval_s: float) -> "Lines":
+    def averaged(self, interval_s: float) -> "LineSpectrum":
         """Give the mean over intervals, at the time of their middles: what increments hold."""
         return replace(self, phasor=self.phasor * np.sinc(self.frequency_hz * interval_s)[:, None])
 
-    def seen(self, interval_s: float) -> "Lines":
+    def seen(self, interval_s: float) -> "LineSpectrum":
         """Give the lines where samples show them, no higher than half the sample rate.
 
         Parameters
@@ -199,7 +199,7 @@ class Lines:
         phasor = self.phasor * np.where(m % 2 == 0, 1.0, -1.0)[:, None]
         return _gathered(zip(self.names, self.frequency_hz - m / interval_s, phasor, strict=True))
 
-    def __sub__(self, other: "Lines") -> "Lines":
+    def __sub__(self, other: "LineSpectrum") -> "LineSpectrum":
         pairs = (
             (name, frequency, sign * phasor)
             for lines, sign in ((self, 1.0), (other, -1.0))
@@ -208,7 +208,7 @@ class Lines:
         return _gathered(pairs)
 
 
-def size_effect(dither: Dither, C_ba: ArrayLike, r_b: ArrayLike) -> Lines:
+def size_effect(dither: Dither, C_ba: ArrayLike, r_b: ArrayLike) -> LineSpectrum:
     """Give what the accelerometers feel at an instant: the three sums above.
 
     Parameters
@@ -230,7 +230,7 @@ def size_effect(dither: Dither, C_ba: ArrayLike, r_b: ArrayLike) -> Lines:
 
 def compensated(
     dither: Dither, C_ba: ArrayLike, r_b: ArrayLike, rate_filter: RateFilter, interval_s: float
-) -> Lines:
+) -> LineSpectrum:
     """Give what the compensation takes off increments in which a dither is, as a mean over each interval.
 
     Parameters
@@ -288,7 +288,7 @@ def _lines(
     r_b: ArrayLike,
     slope: Phasors,
     squares: Sequence[tuple[float, Phasors]],
-) -> Lines:
+) -> LineSpectrum:
     """Lines of the tangential part, `slope` times the rates, and of a weighted sum of centripetal ones.
 
     Each of `squares` is a weight and the gains of the gyros' rates.
@@ -326,7 +326,7 @@ def _lines(
     return _gathered(terms())
 
 
-def _gathered(terms: Iterable[tuple[str, float, Phasors]]) -> Lines:
+def _gathered(terms: Iterable[tuple[str, float, Phasors]]) -> LineSpectrum:
     """Make one line of all that are at a frequency; a negative one is its mirror."""
     names: dict[float, dict[str, None]] = {}
     sums: dict[float, Phasors] = {}
@@ -337,4 +337,4 @@ def _gathered(terms: Iterable[tuple[str, float, Phasors]]) -> Lines:
         names.setdefault(at, {}).update(dict.fromkeys(name.split(", ")))
     order = sorted(sums)
     phasors = np.array([sums[at] for at in order], np.complex128).reshape(-1, 3)
-    return Lines(tuple(", ".join(names[at]) for at in order), np.array(order), phasors)
+    return LineSpectrum(tuple(", ".join(names[at]) for at in order), np.array(order), phasors)

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.certificate import arms_of
+from calib.certificate import lever_arms_of
 from calib.dither.spectrum import AXES, Dither, compensated, gain, in_increments, of_case, size_effect
 from imudrv.arrays import Array
 from imudrv.calibration import Calibration
@@ -46,7 +46,7 @@ def dither_text(
     InputError
         The calibration has no lever arms.
     """
-    arms = arms_of(calibration, f"unit {calibration.serial_number}")
+    arms = lever_arms_of(calibration, f"unit {calibration.serial_number}")
     C_bg, geometry = calibration.gyro.C_bg_array, (calibration.accelerometer.C_ba_array, arms.r_b)
     amplitude = np.asarray(amplitude_arcsec, np.float64) * ARCSEC
     block = in_increments(C_bg, amplitude, frequency_hz)

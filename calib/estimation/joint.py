@@ -32,7 +32,7 @@ import numpy as np
 
 from calib.estimation.linear_system import (
     NormalEquations,
-    Unknowns,
+    Parameters,
     parameter_groups,
     prior_parameters,
     rank_reason,
@@ -44,7 +44,14 @@ from calib.estimation.linear_system import (
     unobservable_text,
     velocity_gain,
 )
-from calib.estimation.result import CHI_SQUARE_LIMIT, SHIFT_FREE, Extra, Identification, LeftOut, Nuisance
+from calib.estimation.result import (
+    CENTROID_BASIS,
+    CHI_SQUARE_LIMIT,
+    Extra,
+    LeaveOneOut,
+    LeverArmEstimate,
+    ParameterEstimate,
+)
 from calib.estimation.runs import Priors, Run
 from imudrv.arrays import Array
 from imudrv.errors import InputError
@@ -58,14 +65,14 @@ PIVOT_SIGMA: Final = 0.1
 """Prior of such a pivot, m."""
 
 
-def joint(
+def estimate_joint(
     runs: Sequence[Run],
     priors: Priors | None = None,
     *,
     pivot: Literal["free", "fixed"] = "free",
     nine: bool = False,
     extra: Sequence[Extra] = (),
-) -> Identification:
+) -> LeverArmEstimate:
     """Estimate R with all that the rests before and after tell; the default method.
 
     Parameters
@@ -106,7 +113,7 @@ def joint(
     system = NormalEquations(
         [run_equations(run, noise, pivot, terms) for run in runs], prior_parameters(runs, priors, terms)
     )
-    basis = np.eye(9) if pivot == "fixed" else SHIFT_FREE
+    basis = np.eye(9) if pivot == "fixed" else CENTROID_BASIS
     sigma, directions = system.directions()
     rank = int((sigma < priors.arm).sum())
     wanted = basis.shape[1]
@@ -118,13 +125,13 @@ def joint(
         _check_pivot(system, chi_square, freedom)
     names = system.unknowns.names
     spread = np.sqrt(np.diag(covariance))
-    nuisances = tuple(
-        Nuisance(name, float(value), float(s), float(prior))
+    parameters = tuple(
+        ParameterEstimate(name, float(value), float(s), float(prior))
         for name, value, s, prior in zip(names, x[9:], spread[9:], system.unknowns.sigma, strict=True)
     )
     told = [velocity_gain(run) for run in runs]
     seen = sigma[sigma < priors.arm]
-    return Identification(
+    return LeverArmEstimate(
         method="joint",
         gauge="given" if pivot == "fixed" else "centroid",
         R_b=x[:9].reshape(3, 3),
@@ -136,16 +143,18 @@ def joint(
         chi_square=chi_square,
         degrees_of_freedom=freedom,
         noise=noise,
-        nuisances=nuisances,
+        parameters=parameters,
         correlation=covariance[:9, 9:] / np.outer(np.maximum(spread[:9], 1e-300), spread[9:]),
-        left_out=tuple(_left_out(system, k, run.label, x, basis, priors.arm) for k, run in enumerate(runs)),
+        leave_one_out=tuple(
+            _left_out(system, k, run.label, x, basis, priors.arm) for k, run in enumerate(runs)
+        ),
         runs=tuple(
             run_result(run, *told[k], x[:9], part.t_s, part.v_n, part.columns @ x[system.columns_of(k)])
             for k, (run, part) in enumerate(zip(runs, system.parts, strict=True))
         ),
         notes=tuple(
             f"{n.name} not observable in these runs: sigma {_readable(n.name, n.sigma)}"
-            for n in nuisances
+            for n in parameters
             if n.name.split("_")[0] in extra and not n.seen
         ),
     )
@@ -164,7 +173,7 @@ def _check_pivot(system: NormalEquations, chi_square: float, freedom: int) -> No
             part._replace(columns=part.columns @ M, N=M.T @ part.N @ M, b=M.T @ part.b)
             for part in system.parts
         ],
-        Unknowns((), np.concatenate([system.unknowns.sigma[: system.unknowns.shared], sigma]), cut - 9),
+        Parameters((), np.concatenate([system.unknowns.sigma[: system.unknowns.shared], sigma]), cut - 9),
     )
     x, _ = apart.solve(np.eye(9))
     better, _ = apart.chi_square(x, 9)
@@ -176,12 +185,14 @@ def _check_pivot(system: NormalEquations, chi_square: float, freedom: int) -> No
         )
 
 
-def _left_out(system: NormalEquations, k: int, label: str, x: Array, basis: Array, least: float) -> LeftOut:
+def _left_out(
+    system: NormalEquations, k: int, label: str, x: Array, basis: Array, least: float
+) -> LeaveOneOut:
     other = system.without(k)
     rank = int((other.directions()[0] < least).sum())
     if rank < basis.shape[1]:
-        return LeftOut(label, rank, None)
-    return LeftOut(label, rank, (other.solve(basis)[0] - x)[:9].reshape(3, 3))
+        return LeaveOneOut(label, rank, None)
+    return LeaveOneOut(label, rank, (other.solve(basis)[0] - x)[:9].reshape(3, 3))
 
 
 def _readable(name: str, value: float) -> str:

@@ -18,15 +18,15 @@ from imudrv.errors import InputError
 from imudrv.nav.earth import earth_rate_n
 from imudrv.units import MM, NS
 
-ROWS_A_BIN: Final = round(BIN_S / (BLOCK_NS * NS))
+ROWS_PER_BIN: Final = round(BIN_S / (BLOCK_NS * NS))
 """Rows at rest that make one equation."""
 
 
-ROWS_A_POINT: Final = 5
+ROWS_PER_POINT: Final = 5
 """With a known pivot each so-manieth row of the motion is an equation too."""
 
 
-TOLD_S: Final = 0.5
+GAIN_WINDOW_S: Final = 0.5
 """`plain` takes the mean velocity over so long after the rotation, s."""
 
 
@@ -46,7 +46,7 @@ ROUNDING: Final = 1e-7
 """A direction seen so much worse than the best one is not told from rounding."""
 
 
-class Unknowns(NamedTuple):
+class Parameters(NamedTuple):
     """Names and priors of a session's unknowns but R, in the order of their columns.
 
     Attributes
@@ -84,7 +84,7 @@ class RunEquations(NamedTuple):
 class NormalEquations:
     """Normal equations of a session; the unknowns are R, what all runs share, and phi_0 of each run."""
 
-    def __init__(self, parts: Sequence[RunEquations], unknowns: Unknowns) -> None:
+    def __init__(self, parts: Sequence[RunEquations], unknowns: Parameters) -> None:
         self.parts, self.unknowns = parts, unknowns
         self.scale = np.concatenate([np.full(9, 0.1), unknowns.sigma])
         n = len(self.scale)
@@ -132,7 +132,7 @@ class NormalEquations:
         return float(yy - 2.0 * self.b @ x + x @ self.N @ x), count - of_R
 
 
-def prior_parameters(runs: Sequence[Run], priors: Priors, terms: Sequence[str]) -> Unknowns:
+def prior_parameters(runs: Sequence[Run], priors: Priors, terms: Sequence[str]) -> Parameters:
     """Return names and priors of all parameters but R."""
     off = ~np.eye(3, dtype=bool)
     accelerometer = np.where(off, priors.accelerometer_misalignment, priors.accelerometer_scale)
@@ -158,7 +158,7 @@ def prior_parameters(runs: Sequence[Run], priors: Priors, terms: Sequence[str]) 
         for run in runs
     ]
     names = tuple(f"{name}_{part}" for name, parts, _ in groups for part in parts)
-    return Unknowns(names, np.concatenate([sigma for _, _, sigma in groups]), shared)
+    return Parameters(names, np.concatenate([sigma for _, _, sigma in groups]), shared)
 
 
 def rest_noise(runs: Sequence[Run]) -> Noise:
@@ -263,7 +263,7 @@ def run_equations(run: Run, noise: Noise, pivot: str, terms: Sequence[str]) -> R
     parts = 3 if pivot == "fixed" else 2
     rows = [whole_bins(run.before, True), whole_bins(run.after, False)]
     if pivot == "fixed":
-        rows.insert(1, np.flatnonzero(~(run.before | run.after))[::ROWS_A_POINT, None])
+        rows.insert(1, np.flatnonzero(~(run.before | run.after))[::ROWS_PER_POINT, None])
     columns = design_columns(run, terms)[:, :parts]
 
     def mean(x: Array) -> Array:
@@ -284,9 +284,9 @@ def run_equations(run: Run, noise: Noise, pivot: str, terms: Sequence[str]) -> R
 def whole_bins(mask: NDArray[np.bool_], from_the_end: bool) -> NDArray[np.int64]:
     """Rows of each whole bin, (bins, rows a bin); what is over lies far from the rotation."""
     at = np.flatnonzero(mask)
-    over = len(at) % ROWS_A_BIN
+    over = len(at) % ROWS_PER_BIN
     at = at[over:] if from_the_end else at[: len(at) - over]
-    return at.reshape(-1, ROWS_A_BIN)
+    return at.reshape(-1, ROWS_PER_BIN)
 
 
 def velocity_gain(run: Run) -> tuple[Array, Array]:
@@ -299,7 +299,7 @@ def velocity_gain(run: Run) -> tuple[Array, Array]:
 
 def gain_rows(run: Run) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the rows of the half second before a rotation and of that after it."""
-    n = round(TOLD_S / (BLOCK_NS * NS))
+    n = round(GAIN_WINDOW_S / (BLOCK_NS * NS))
     return np.flatnonzero(run.before)[-n:], np.flatnonzero(run.after)[:n]
 
 

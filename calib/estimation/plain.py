@@ -8,7 +8,7 @@ from scipy.linalg import solve_triangular
 from calib.detection.noise import Noise
 from calib.estimation.linear_system import (
     ROUNDING,
-    Unknowns,
+    Parameters,
     bin_variance,
     design_columns,
     gain_rows,
@@ -25,13 +25,13 @@ from calib.estimation.linear_system import (
     velocity_gain,
     whole_bins,
 )
-from calib.estimation.result import SHIFT_FREE, Identification
+from calib.estimation.result import CENTROID_BASIS, LeverArmEstimate
 from calib.estimation.runs import Priors, Run
 from imudrv.arrays import Array
 from imudrv.errors import InputError
 
 
-def plain(runs: Sequence[Run], priors: Priors | None = None) -> Identification:
+def estimate_plain(runs: Sequence[Run], priors: Priors | None = None) -> LeverArmEstimate:
     """Solve `V = H R`, the literature's way: one velocity for each rotation, nothing else estimated.
 
     V and H are what the rotation gained: means over the half second after it less those before it. The
@@ -71,14 +71,14 @@ def plain(runs: Sequence[Run], priors: Priors | None = None) -> Identification:
     sigma = sigma_v / np.maximum(s, ROUNDING * s[0])
     rank = int((sigma < priors.arm).sum())
     if rank < 6:
-        raise InputError(unobservable_text(sigma, directions.T, SHIFT_FREE, priors.arm))
-    inverse = SHIFT_FREE @ np.linalg.pinv(H @ SHIFT_FREE)
+        raise InputError(unobservable_text(sigma, directions.T, CENTROID_BASIS, priors.arm))
+    inverse = CENTROID_BASIS @ np.linalg.pinv(H @ CENTROID_BASIS)
     R = inverse @ V
     rest = np.eye(len(V)) - H @ inverse  # what a solution of least squares leaves, not of least chi-square
     left, freedom = rest @ V, max(0, len(V) - 6)
     values, vectors = np.linalg.eigh(rest @ S @ rest.T)
     of_left = (vectors.T @ left)[len(V) - freedom :]
-    return Identification(
+    return LeverArmEstimate(
         method="plain",
         gauge="centroid",
         R_b=R.reshape(3, 3),
@@ -90,9 +90,9 @@ def plain(runs: Sequence[Run], priors: Priors | None = None) -> Identification:
         chi_square=float((of_left**2 / values[len(V) - freedom :]).sum()),
         degrees_of_freedom=freedom,
         noise=noise,
-        nuisances=(),
+        parameters=(),
         correlation=np.zeros((9, 0)),
-        left_out=(),
+        leave_one_out=(),
         runs=tuple(
             run_result(run, *told_run, R, *velocity_at_rest(run, R))
             for run, told_run in zip(runs, told, strict=True)
@@ -101,7 +101,7 @@ def plain(runs: Sequence[Run], priors: Priors | None = None) -> Identification:
     )
 
 
-def _plain_covariance(runs: Sequence[Run], noise: Noise, unknowns: Unknowns, terms: Sequence[str]) -> Array:
+def _plain_covariance(runs: Sequence[Run], noise: Noise, unknowns: Parameters, terms: Sequence[str]) -> Array:
     """Covariance of the stacked velocities of `velocity_gain`, from priors and noise.
 
     The alignment has chosen tilt and heading so that the rest before shows no acceleration: what is not known

@@ -12,14 +12,14 @@ from calib.detection.blocks import BLOCK_NS
 from calib.detection.noise import Noise
 from calib.detection.segments import Rotation
 from calib.estimation.linear_system import (
-    TOLD_S,
+    GAIN_WINDOW_S,
     NormalEquations,
     parameter_groups,
     prior_parameters,
     run_equations,
     unobservable_text,
 )
-from calib.estimation.result import DIFFERENCES, SHIFT_FREE
+from calib.estimation.result import CENTROID_BASIS, TO_DIFFERENCES
 from calib.estimation.runs import AFTER_S, BEFORE_S, GUARD_S, Priors, Run
 from imudrv.arrays import Array
 from imudrv.errors import InputError
@@ -33,7 +33,7 @@ _PLAN_INTERVAL_NS: Final = 5_000_000
 
 
 @dataclass(frozen=True)
-class Planned:
+class PlannedRotation:
     """A rotation that is planned.
 
     Attributes
@@ -74,7 +74,7 @@ class Prediction:
 
 
 def predict(
-    plan: Sequence[Planned], latitude_rad: float, noise: Noise, priors: Priors | None = None
+    plan: Sequence[PlannedRotation], latitude_rad: float, noise: Noise, priors: Priors | None = None
 ) -> Prediction:
     """Covariance that a plan will give, from an ideal motion and without data.
 
@@ -101,29 +101,29 @@ def predict(
     priors = priors or Priors()
     if not plan:
         raise InputError("plan: expected one rotation at least, got none")
-    runs = [_ideal(planned, k, latitude_rad, priors) for k, planned in enumerate(plan)]
+    runs = [_planned_run(planned, k, latitude_rad, priors) for k, planned in enumerate(plan)]
     terms = parameter_groups(priors, ())
     system = NormalEquations(
         [run_equations(run, noise, "free", terms) for run in runs], prior_parameters(runs, priors, terms)
     )
     sigma, directions = system.directions()
     if int((sigma < priors.arm).sum()) < 6:
-        raise InputError(unobservable_text(sigma, directions, SHIFT_FREE, priors.arm))
-    covariance = system.solve(SHIFT_FREE)[1][:9, :9]
-    spread = np.sqrt(np.diag(DIFFERENCES @ covariance @ DIFFERENCES.T))
+        raise InputError(unobservable_text(sigma, directions, CENTROID_BASIS, priors.arm))
+    covariance = system.solve(CENTROID_BASIS)[1][:9, :9]
+    spread = np.sqrt(np.diag(TO_DIFFERENCES @ covariance @ TO_DIFFERENCES.T))
     return Prediction(covariance, spread.reshape(2, 3))
 
 
-def _ideal(planned: Planned, k: int, latitude_rad: float, priors: Priors) -> Run:
+def _planned_run(planned: PlannedRotation, k: int, latitude_rad: float, priors: Priors) -> Run:
     """The run that a planned rotation would make: level, about the vertical, nothing in error."""
     T, n = _PLAN_INTERVAL_NS * NS, round(planned.duration_s / (_PLAN_INTERVAL_NS * NS))
     before, after = round(BEFORE_S / T), round(min(planned.after_s, AFTER_S) / T)
     up_b = np.array([planned.up == f"+{a}" for a in "XYZ"], np.float64)
     up_b -= [planned.up == f"-{a}" for a in "XYZ"]
-    if not up_b.any() or n < 1 or after * T < TOLD_S:
+    if not up_b.any() or n < 1 or after * T < GAIN_WINDOW_S:
         raise InputError(
-            f"plan: expected an axis up from +X to -Z, a duration, and a rest of {TOLD_S:g} s at least, "
-            f"got {planned}"
+            f"plan: expected an axis up from +X to -Z, a duration, and a rest of "
+            f"{GAIN_WINDOW_S:g} s at least, got {planned}"
         )
     u = np.clip((np.arange(before + n + after + 1) - before) / n, 0.0, 1.0)
     angle = planned.angle_deg * DEG * u**3 * (10.0 - 15.0 * u + 6.0 * u * u)

@@ -15,7 +15,7 @@ CHI_SQUARE_LIMIT: Final = 2.0
 """Chi-square per degree of freedom from which data contradict the model."""
 
 
-SEEN_RATIO: Final = 0.5
+OBSERVABLE_RATIO: Final = 0.5
 """An extra unknown whose sigma is not below this part of its prior is not seen."""
 
 
@@ -24,16 +24,16 @@ def _shift_free() -> Array:
     return basis
 
 
-SHIFT_FREE: Final = _shift_free()
+CENTROID_BASIS: Final = _shift_free()
 """Orthonormal basis, (9, 6), of the arms whose centroid is the origin."""
 
 
-DIFFERENCES: Final = np.kron([[1.0, -1.0, 0.0], [1.0, 0.0, -1.0]], np.eye(3))
+TO_DIFFERENCES: Final = np.kron([[1.0, -1.0, 0.0], [1.0, 0.0, -1.0]], np.eye(3))
 """(6, 9): from (r_x, r_y, r_z) to (r_x - r_y, r_x - r_z)."""
 
 
 @dataclass(frozen=True)
-class Nuisance:
+class ParameterEstimate:
     """An unknown beside R, SI.
 
     Attributes
@@ -52,7 +52,7 @@ class Nuisance:
     @property
     def seen(self) -> bool:
         """Whether the data tell more than the prior."""
-        return self.sigma < SEEN_RATIO * self.prior
+        return self.sigma < OBSERVABLE_RATIO * self.prior
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class RunResult:
 
 
 @dataclass(frozen=True)
-class LeftOut:
+class LeaveOneOut:
     """The estimate without one rotation.
 
     Attributes
@@ -115,7 +115,7 @@ class LeftOut:
 
 
 @dataclass(frozen=True)
-class Identification:
+class LeverArmEstimate:
     """The inner lever arms.
 
     Attributes
@@ -163,9 +163,9 @@ class Identification:
     chi_square: float
     degrees_of_freedom: int
     noise: Noise
-    nuisances: tuple[Nuisance, ...]
+    parameters: tuple[ParameterEstimate, ...]
     correlation: Array
-    left_out: tuple[LeftOut, ...]
+    leave_one_out: tuple[LeaveOneOut, ...]
     runs: tuple[RunResult, ...]
     notes: tuple[str, ...]
 
@@ -178,13 +178,13 @@ class Identification:
     @property
     def differences(self) -> Array:
         """`r_x - r_y` and `r_x - r_z`, m, shape (2, 3): the same in every gauge."""
-        differences: Array = (DIFFERENCES @ self.R_b.ravel()).reshape(2, 3)
+        differences: Array = (TO_DIFFERENCES @ self.R_b.ravel()).reshape(2, 3)
         return differences
 
     @property
     def differences_covariance(self) -> Array:
         """Covariance of the six differences, m^2, shape (6, 6)."""
-        covariance: Array = DIFFERENCES @ self.covariance @ DIFFERENCES.T
+        covariance: Array = TO_DIFFERENCES @ self.covariance @ TO_DIFFERENCES.T
         return covariance
 
     @property

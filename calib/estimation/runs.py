@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calib.detection.acceptance import Limits, judge
+from calib.detection.acceptance import RotationLimits, rejection_reasons
 from calib.detection.blocks import BLOCK_NS
 from calib.detection.segments import Rotation, Segments, find_segments
 from calib.estimation.low_pass import without_dither
@@ -104,7 +104,7 @@ class Run:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class CaptureRuns:
     """What a capture gives.
 
     Attributes
@@ -122,16 +122,16 @@ class Evidence:
     rejected: tuple[tuple[Rotation, tuple[str, ...]], ...]
 
 
-def collect(
+def navigate_rotations(
     read: Callable[[], Iterable[Records]],
     C_ba: ArrayLike,
     site: Site,
     *,
     label: str = "",
-    limits: Limits | None = None,
+    limits: RotationLimits | None = None,
     priors: Priors | None = None,
     expected: str | None = None,
-) -> Evidence:
+) -> CaptureRuns:
     """Find the rotations of a capture and navigate them.
 
     Parameters
@@ -161,26 +161,26 @@ def collect(
     InputError
         The capture is too short, or a rest cannot be aligned on.
     """
-    limits, priors = limits or Limits(), priors or Priors()
+    limits, priors = limits or RotationLimits(), priors or Priors()
     segments = find_segments(without_dither(read()))
-    verdicts = [(rotation, judge(rotation, limits, expected)) for rotation in segments.rotations]
+    verdicts = [(rotation, rejection_reasons(rotation, limits, expected)) for rotation in segments.rotations]
     good = [rotation for rotation, reasons in verdicts if not reasons]
     open_runs = [
-        _OpenRun(f"{label}#{k + 1}", rotation, segments.interval_s, C_ba, site, priors)
+        _RunBuilder(f"{label}#{k + 1}", rotation, segments.interval_s, C_ba, site, priors)
         for k, rotation in enumerate(good)
     ]
     if open_runs:
         for piece in without_dither(read()):
             for run in open_runs:
                 run.feed(piece)
-    return Evidence(
+    return CaptureRuns(
         segments,
         tuple(run.result() for run in open_runs),
         tuple((rotation, reasons) for rotation, reasons in verdicts if reasons),
     )
 
 
-class _OpenRun:
+class _RunBuilder:
     """One rotation on its way: takes what concerns it from the pieces that come by."""
 
     def __init__(

@@ -16,12 +16,6 @@ before scale and misalignment M, ours on the sensing axes: they differ by misali
 `imuclbt(imu, clbt)` takes `S [rx; ry; rz]` off the specific force with the S of ours, and `sysclbt` finds it
 in that sense: the sign is ours. Where `imuclbt` is used to spoil perfect data with a struct, the unit so made
 has its points at minus that struct: its `clbt.rx` of (1, 2, 3) cm makes a unit with r_x = -(10, 20, 30) mm.
-
->>> arms = Arms(np.array([[24, -11, -9], [-23, 29, -7], [-1, -18, 16]]) * 1e-3, None, "centroid")
->>> to_kalibr(arms)["accelerometers"]["ry_i"]
-[-0.047, 0.04, 0.002]
->>> to_psins(arms)["rx"]
-[0.024, -0.011, -0.009]
 """
 
 from dataclasses import dataclass
@@ -48,7 +42,7 @@ _WEIGHTS: Final = {
 
 
 @dataclass(frozen=True)
-class Arms:
+class LeverArms:
     """The sensing points in a gauge.
 
     Attributes
@@ -66,7 +60,9 @@ class Arms:
     gauge: Gauge
 
 
-def convert(arms: Arms, to: Gauge, stated: tuple[Literal["x", "y", "z"], ArrayLike] | None = None) -> Arms:
+def convert(
+    arms: LeverArms, to: Gauge, stated: tuple[Literal["x", "y", "z"], ArrayLike] | None = None
+) -> LeverArms:
     """Go over to another gauge.
 
     Parameters
@@ -109,8 +105,8 @@ def convert(arms: Arms, to: Gauge, stated: tuple[Literal["x", "y", "z"], ArrayLi
     return _shifted(arms, to, _WEIGHTS[accelerometer], point)
 
 
-def _shifted(arms: Arms, gauge: Gauge, weights: tuple[float, float, float], origin: Array) -> Arms:
+def _shifted(arms: LeverArms, gauge: Gauge, weights: tuple[float, float, float], origin: Array) -> LeverArms:
     T = np.eye(9) - np.kron(np.tile(weights, (3, 1)), np.eye(3))
     r_b = (T @ arms.r_b.ravel()).reshape(3, 3) + origin
     covariance = None if arms.covariance is None else T @ arms.covariance @ T.T
-    return Arms(r_b, covariance, gauge)
+    return LeverArms(r_b, covariance, gauge)

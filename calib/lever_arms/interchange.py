@@ -1,11 +1,19 @@
-"""Lever arms in the formats of Kalibr and PSINS."""
+"""Lever arms in the formats of Kalibr and PSINS.
+
+>>> from calib.lever_arms.gauge import LeverArms
+>>> arms = LeverArms(np.array([[24, -11, -9], [-23, 29, -7], [-1, -18, 16]]) * 1e-3, None, "centroid")
+>>> to_kalibr(arms)["accelerometers"]["ry_i"]
+[-0.047, 0.04, 0.002]
+>>> to_psins(arms)["rx"]
+[0.024, -0.011, -0.009]
+"""
 
 from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
 
-from calib.lever_arms.gauge import Arms, convert
+from calib.lever_arms.gauge import LeverArms, convert
 from imudrv.arrays import Array
 from imudrv.errors import InputError
 
@@ -13,7 +21,7 @@ _DIGITS: Final = 12
 """Decimals of a metre that other programs' files get."""
 
 
-def to_kalibr(arms: Arms) -> dict[str, Any]:
+def to_kalibr(arms: LeverArms) -> dict[str, Any]:
     """The arms as Kalibr's IMU file has them.
 
     Parameters
@@ -30,7 +38,7 @@ def to_kalibr(arms: Arms) -> dict[str, Any]:
     return {"accelerometers": {f"r{axis}_i": _list(r) for axis, r in zip("xyz", r_b, strict=True)}}
 
 
-def from_kalibr(document: Mapping[str, Any]) -> Arms:
+def from_kalibr(document: Mapping[str, Any]) -> LeverArms:
     """Read the arms of Kalibr's IMU file.
 
     Parameters
@@ -50,10 +58,10 @@ def from_kalibr(document: Mapping[str, Any]) -> Arms:
     """
     section = document.get("accelerometers")
     r_b = _points("Kalibr: accelerometers", section, [f"r{axis}_i" for axis in "xyz"])
-    return convert(Arms(r_b, None, "given"), "x")
+    return convert(LeverArms(r_b, None, "given"), "x")
 
 
-def to_psins(arms: Arms) -> dict[str, list[float]]:
+def to_psins(arms: LeverArms) -> dict[str, list[float]]:
     """The arms as a PSINS calibration struct has them, for `imuclbt` to compensate with.
 
     Parameters
@@ -69,7 +77,7 @@ def to_psins(arms: Arms) -> dict[str, list[float]]:
     return {f"r{axis}": _list(r) for axis, r in zip("xyz", arms.r_b, strict=True)}
 
 
-def from_psins(clbt: Mapping[str, Any]) -> Arms:
+def from_psins(clbt: Mapping[str, Any]) -> LeverArms:
     """Read the arms of a PSINS calibration struct, as `sysclbt` finds it.
 
     Parameters
@@ -87,7 +95,7 @@ def from_psins(clbt: Mapping[str, Any]) -> Arms:
     InputError
         There are no such arms in it.
     """
-    return Arms(_points("PSINS: clbt", clbt, ["rx", "ry", "rz"]), None, "given")
+    return LeverArms(_points("PSINS: clbt", clbt, ["rx", "ry", "rz"]), None, "given")
 
 
 def _list(r: Array) -> list[float]:

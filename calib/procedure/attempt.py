@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from calib.detection.blocks import Block
 from calib.detection.segments import Rotation, Segmenter
-from calib.detection.tracking import Means, Turn
-from calib.procedure.events import Log
+from calib.detection.tracking import RestAverages, RotationTracker
+from calib.procedure.events import NavigationLog
 from imudrv.arrays import Array
 from imudrv.nav.alignment import MIN_ALIGNMENT_S, Aligned, Alignment
 from imudrv.nav.mechanisation import Navigator
@@ -25,9 +25,9 @@ class Attempt:
         self.alignment: Alignment | None = None
         self.aligned: Aligned | None = None
         self.heading = 0.0  # how far it stood turned clockwise, rad
-        self.means = Means()
+        self.means = RestAverages()
         self.look_s = MIN_ALIGNMENT_S  # when the alignment is looked at next
-        self.turn = Turn()
+        self.turn = RotationTracker()
         self._held: list[Records] = []
         self._behind: Records | None = None  # samples behind the alignment's window
         self._segmenter = Segmenter()
@@ -61,7 +61,7 @@ class Attempt:
 
     def navigate(self, navigator: Navigator, up_b: Vector) -> None:
         """Begin the log."""
-        self._navigator, self.turn = navigator, Turn(up_b)
+        self._navigator, self.turn = navigator, RotationTracker(up_b)
         self._navigated.clear()
         if self._behind is not None:
             self._navigate(self._behind)
@@ -78,9 +78,9 @@ class Attempt:
         assert begun is not None
         return next((r for r in self._segmenter.result().rotations if r.stop > begun), None)
 
-    def log(self, step_id: str, number: int, interval_s: float) -> Log:
+    def log(self, step_id: str, number: int, interval_s: float) -> NavigationLog:
         """Return velocity and H of all navigated samples."""
         assert self._first is not None
         counter, v_n, H = (np.concatenate(parts) for parts in zip(*self._navigated, strict=True))
         t_s = (counter + 1 - counter[0]) * interval_s
-        return Log(step_id, number, self._first, self._last, counter, t_s, v_n, H)
+        return NavigationLog(step_id, number, self._first, self._last, counter, t_s, v_n, H)

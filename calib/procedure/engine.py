@@ -13,7 +13,7 @@ preflight found, by the rule of `calib.detection.segments`; the verdict on a rot
 cuts these from a recording finds the same.
 
 Velocity and H of every sample from the end of an alignment to the end of the rest after the turn are in the
-`Log` of the run. Where the turn is waited for, the log begins anew each minute.
+`NavigationLog` of the run. Where the turn is waited for, the log begins anew each minute.
 """
 
 from collections.abc import Mapping
@@ -22,11 +22,11 @@ from typing import Final
 
 import numpy as np
 
-from calib.detection.acceptance import judge
-from calib.detection.blocks import BLOCK_NS, Block, Cutter
+from calib.detection.acceptance import rejection_reasons
+from calib.detection.blocks import BLOCK_NS, Block, BlockSplitter
 from calib.detection.segments import LEAST_FORCE, QUIET_S, SIGMAS, Rotation
-from calib.detection.tracking import MG, Means, Posture, Stillness
-from calib.estimation.linear_system import TOLD_S
+from calib.detection.tracking import MG, AttitudeTracker, RestAverages, StillnessDetector
+from calib.estimation.linear_system import GAIN_WINDOW_S
 from calib.estimation.runs import GUARD_S, Priors
 from calib.procedure import prompts
 from calib.procedure.attempt import Attempt
@@ -42,7 +42,7 @@ from calib.procedure.events import (
     Entered,
     Event,
     Finished,
-    Log,
+    NavigationLog,
     Phase,
     Redo,
     Redone,
@@ -54,7 +54,7 @@ from calib.procedure.events import (
 )
 from calib.procedure.plan import predicted
 from calib.procedure.preflight import axis_faults
-from calib.procedure.prompts import NAMED_RAD, READY_S, Says, Seen, way_round, wrong_way
+from calib.procedure.prompts import NAMED_RAD, READY_S, Says, StepObservation, pose_text, wrong_direction_text
 from calib.procedure.schema import Procedure, Step
 from imudrv.calibration import Calibration
 from imudrv.errors import InputError
@@ -79,7 +79,7 @@ __all__ = [
     "Entered",
     "Event",
     "Finished",
-    "Log",
+    "NavigationLog",
     "Phase",
     "Redo",
     "Redone",
@@ -142,11 +142,11 @@ class Engine:
         self._steps = procedure.steps
         self._interval_s = interval_ns * NS
         self._hands_free = hands_free
-        self._cutter = Cutter(interval_ns)
-        self._posture = Posture(site.latitude_rad)
+        self._cutter = BlockSplitter(interval_ns)
+        self._posture = AttitudeTracker(site.latitude_rad)
         limits = procedure.limits
         # wide, so that a unit that is too noisy is seen to rest, and its noise is then named
-        self._still = Stillness(
+        self._still = StillnessDetector(
             *_motion_limits(3.0 * limits.noise_deg_per_s * DEG, 3.0 * limits.noise_mg * MG)
         )
         self._conditions = Conditions()
@@ -158,9 +158,9 @@ class Engine:
         self._accepted = dict(accepted or {})
         self._skipped: set[str] = set()
         self._attempts = dict(attempts or {})
-        self._logs: list[Log] = []
+        self._logs: list[NavigationLog] = []
         self._attempt = Attempt()
-        self._preflight = Means()
+        self._preflight = RestAverages()
         self._checks = 1
         self._check_failed = False
         self._elapsed_s = 0.0  # of the phase
@@ -264,7 +264,7 @@ class Engine:
         return {s.id: self._accepted[s.id] for s in self._steps if s.id in self._accepted}
 
     @property
-    def runs(self) -> tuple[Log, ...]:
+    def runs(self) -> tuple[NavigationLog, ...]:
         """Logs of all runs that were accepted here, in time, also of those that were done again."""
         return tuple(self._logs)
 
@@ -363,8 +363,8 @@ class Engine:
     # Samples
 
     @property
-    def _seen(self) -> Seen:
-        return Seen(
+    def _seen(self) -> StepObservation:
+        return StepObservation(
             self._step,
             self._procedure.limits,
             self._posture,
@@ -410,7 +410,7 @@ class Engine:
     def _check(self, block: Block) -> None:
         """PREFLIGHT: half a minute at rest tells whether the unit is sound."""
         if self._still.moving or block.flags & Flag.WARM_UP:
-            self._preflight, self._elapsed_s = Means(), 0.0
+            self._preflight, self._elapsed_s = RestAverages(), 0.0
             self._check_failed = self._check_failed and not self._still.moving
             return
         self._preflight.feed(block)
@@ -427,7 +427,7 @@ class Engine:
                 "looked at again",
             )
             return
-        self._preflight, self._elapsed_s = Means(), 0.0
+        self._preflight, self._elapsed_s = RestAverages(), 0.0
         self._reasons = self._unsound(found)
         if self._reasons:
             if not self._check_failed:
@@ -449,7 +449,7 @@ class Engine:
         )
         self._begin()
 
-    def _unsound(self, found: Means) -> tuple[str, ...]:
+    def _unsound(self, found: RestAverages) -> tuple[str, ...]:
         """What the preflight has against the unit."""
         limits, reasons = self._procedure.limits, []
         if found.flags & Flag.FAULT or self._conditions.faults:
@@ -483,7 +483,7 @@ class Engine:
         ]
         return outside or ([f"a temperature is off, {holds}"] if flags & Flag.TEMPERATURE_RANGE else [])
 
-    def _axis_faults(self, found: Means) -> tuple[str, ...]:
+    def _axis_faults(self, found: RestAverages) -> tuple[str, ...]:
         site = self._site
         gravity = site.gravity_m_s2 or normal_gravity(site.latitude_rad, site.height_m)
         return axis_faults(
@@ -613,9 +613,9 @@ class Engine:
         if rotation is None:
             return ("the turn is not to be told from the rest",)
         limits = replace(self._procedure.rotation_limits(step), rest_after_s=rest_after_s)
-        reasons = judge(rotation, limits, step.up[1])
+        reasons = rejection_reasons(rotation, limits, step.up[1])
         if rotation.angle_deg * np.sign(step.turn_deg) < -NAMED_RAD / DEG:
-            return (wrong_way(rotation.angle_deg * DEG, step), *reasons)
+            return (wrong_direction_text(rotation.angle_deg * DEG, step), *reasons)
         return reasons
 
     def _accept(self, rotation: Rotation) -> None:
@@ -624,7 +624,7 @@ class Engine:
         assert rotation.after is not None
         assert attempt.aligned is not None
         log = attempt.log(step_id, self._number, self._interval_s)
-        guard, told = (round(s / self._interval_s) for s in (GUARD_S, TOLD_S))
+        guard, told = (round(s / self._interval_s) for s in (GUARD_S, GAIN_WINDOW_S))
         begin = rotation.stop + guard
         after = (log.counter >= begin) & (log.counter < begin + told)
         east, north, up = log.v_n[after].mean(axis=0).tolist()
@@ -708,7 +708,7 @@ class Engine:
                     f"peak {good.peak_deg_per_s:.0f} deg/s",
                 )
             case Phase.VERDICT:
-                return "REJECTED: DO IT AGAIN", (way_round(seen.step),)
+                return "REJECTED: DO IT AGAIN", (pose_text(seen.step),)
             case Phase.DONE:
                 done = len(self._accepted)
                 return "ALL STEPS DONE", (f"{done} accepted, {steps - done} skipped",)

@@ -222,7 +222,7 @@ Event: TypeAlias = Entered | Checked | Restarted | Accepted | Rejected | Skipped
 
 
 @dataclass(frozen=True)
-class Log:
+class NavigationLog:
     """Velocity and H of every sample of an accepted run, from the end of its alignment on.
 
     Attributes

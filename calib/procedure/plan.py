@@ -8,7 +8,7 @@ from typing import Final
 
 from calib.axes import opposite
 from calib.detection.noise import Noise
-from calib.estimation.predict import Planned, Prediction, predict
+from calib.estimation.predict import PlannedRotation, Prediction, predict
 from calib.estimation.runs import Priors
 from calib.procedure.schema import VERIFICATION, Pose, Procedure, Step
 from imudrv.errors import InputError
@@ -59,7 +59,7 @@ def predicted(
         The rotations do not see the six differences; names the directions.
     """
     plan = [
-        Planned(step.up, step.turn_deg, TURN_S, step.rest_s)
+        PlannedRotation(step.up, step.turn_deg, TURN_S, step.rest_s)
         for step in procedure.steps
         if step.id not in skipped
     ]

@@ -13,8 +13,8 @@ from typing import Final
 import numpy as np
 
 from calib.axes import axis_name, side
-from calib.procedure.prompts import way
-from calib.procedure.schema import Limits, Step
+from calib.procedure.prompts import turn_instruction
+from calib.procedure.schema import ProcedureLimits, Step
 from imudrv.arrays import Array
 from imudrv.nav.earth import EARTH_RATE, earth_rate_n
 from imudrv.units import DEG, DEG_PER_H
@@ -32,7 +32,7 @@ ANOTHER_POSE: Final = 30.0 * DEG
 
 
 def axis_faults(
-    f_b: Array, omega_b: Array, step: Step, limits: Limits, gravity: float, latitude_rad: float
+    f_b: Array, omega_b: Array, step: Step, limits: ProcedureLimits, gravity: float, latitude_rad: float
 ) -> tuple[str, ...]:
     """Why the mean readings at rest are not those of a sound unit in the pose of a step.
 
@@ -82,7 +82,7 @@ def axis_faults(
 class _Pose:
     """What a pose should read, and how far off readings are."""
 
-    def __init__(self, step: Step, limits: Limits, gravity: float, latitude_rad: float) -> None:
+    def __init__(self, step: Step, limits: ProcedureLimits, gravity: float, latitude_rad: float) -> None:
         self._step, self._heading_limit, self._gravity = step, limits.heading_deg * DEG, gravity
         C_bn = step.C_bn
         self._east_b, self._up_b = C_bn[:, 0], C_bn[:, 2]
@@ -137,7 +137,7 @@ class _Pose:
             if up != self._step.up:
                 found.append(f"the unit stands with its {side(up)} side up")
             else:
-                found.append(f"the unit is to be turned {way(turned)}")
+                found.append(f"the unit is to be turned {turn_instruction(turned)}")
         found += [name.format("accelerometer") for name, P in _MISTAKES if self.fits(P @ f_b, omega_b)]
         found += [name.format("gyro") for name, P in _MISTAKES if self.fits(f_b, P @ omega_b)]
         if not found:

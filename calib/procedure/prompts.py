@@ -5,8 +5,8 @@ from math import pi
 from typing import Final, TypeAlias
 
 from calib.axes import axis_name, opposite, side, vector
-from calib.detection.tracking import Posture, Stillness, Turn
-from calib.procedure.schema import Limits, Step
+from calib.detection.tracking import AttitudeTracker, RotationTracker, StillnessDetector
+from calib.procedure.schema import ProcedureLimits, Step
 from imudrv.records import Flag
 from imudrv.units import DEG
 
@@ -31,25 +31,25 @@ _LONG_S: Final = 5.0  # so long in the wrong pose is no passing moment
 _COMPASS: Final = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")
 
 
-def way(clockwise_rad: float) -> str:
+def turn_instruction(clockwise_rad: float) -> str:
     """Say the turn that takes back one of so much clockwise: ``90 deg clockwise, seen from above``."""
     turn = "counter-clockwise" if clockwise_rad > 0.0 else "clockwise"
     return f"{abs(clockwise_rad) / DEG:.0f} deg {turn}, seen from above"
 
 
-def way_round(step: Step) -> str:
+def pose_text(step: Step) -> str:
     """Say a pose."""
     north = axis_name(step.C_bn[:, 1])
     return f"{side(step.up)} up, {side(step.east)} about east, {side(north)} about north"
 
 
-def wrong_way(angle_rad: float, step: Step) -> str:
+def wrong_direction_text(angle_rad: float, step: Step) -> str:
     """Say that a turn has the wrong sign."""
     return f"turns the wrong way: {angle_rad / DEG:+.0f} deg, want {step.turn_deg:+d}"
 
 
 @dataclass(frozen=True)
-class Seen:
+class StepObservation:
     """What the sensors show, and what the step wants.
 
     Attributes
@@ -69,9 +69,9 @@ class Seen:
     """
 
     step: Step
-    limits: Limits
-    posture: Posture
-    still: Stillness
+    limits: ProcedureLimits
+    posture: AttitudeTracker
+    still: StillnessDetector
     flags: int
     faults: tuple[str, ...]
 
@@ -105,48 +105,48 @@ class Seen:
         return self.placed and self.still.quiet_s >= READY_S and not self.unfit
 
 
-def preflight(seen: Seen, failed: bool) -> Says:
+def preflight(seen: StepObservation, failed: bool) -> Says:
     """For the preflight; `failed`: the last check found something."""
     if seen.flags & Flag.WARM_UP:
         return "WARMING UP, WAIT", ("the unit's warm-up bit is set",)
     if seen.still.moving or not (seen.upright or failed):
-        return f"SET IT DOWN: {side(seen.step.up)} UP", (way_round(seen.step), *_motion(seen))
+        return f"SET IT DOWN: {side(seen.step.up)} UP", (pose_text(seen.step), *_motion(seen))
     if failed:
         return "CHECK FAILED: SEE WHY", (
-            way_round(seen.step),
+            pose_text(seen.step),
             "it is checked again and again, and goes on when all is well",
         )
-    return "HANDS OFF, CHECKING", (way_round(seen.step),)
+    return "HANDS OFF, CHECKING", (pose_text(seen.step),)
 
 
-def place(seen: Seen, hands_free: bool) -> Says:
+def place(seen: StepObservation, hands_free: bool) -> Says:
     """For placing the unit; `hands_free`: nobody is asked to confirm."""
     step = seen.step
     if not seen.upright:
-        return f"TURN IT: {side(step.up)} UP", (*_tip(seen), way_round(step))
+        return f"TURN IT: {side(step.up)} UP", (*_tip(seen), pose_text(step))
     if not seen.placed:
         clockwise = seen.clockwise or 0.0
         word = "COUNTER-CLOCKWISE" if clockwise > 0.0 else "CLOCKWISE"
         hint = (
             f"{side(step.east)} points {abs(clockwise) / DEG:.0f} deg off east, want "
-            f"{seen.limits.heading_deg:g} at most: turn it {way(clockwise)}"
+            f"{seen.limits.heading_deg:g} at most: turn it {turn_instruction(clockwise)}"
         )
-        return f"TURN IT {abs(clockwise) / DEG:.0f} DEG {word}", (hint, way_round(step))
+        return f"TURN IT {abs(clockwise) / DEG:.0f} DEG {word}", (hint, pose_text(step))
     if seen.unfit:
         return "WAIT FOR THE UNIT", (seen.unfit,)
     if seen.still.quiet_s < READY_S:
-        return "SET IT DOWN, HANDS OFF", (way_round(step), *_motion(seen))
-    return "HANDS OFF" if hands_free else "READY: CONFIRM", (way_round(step),)
+        return "SET IT DOWN, HANDS OFF", (pose_text(step), *_motion(seen))
+    return "HANDS OFF" if hands_free else "READY: CONFIRM", (pose_text(step),)
 
 
-def settle(seen: Seen) -> Says:
+def settle(seen: StepObservation) -> Says:
     """For standing still before the alignment."""
     if seen.unfit:
         return "WAIT FOR THE UNIT", (seen.unfit,)
     return "HANDS OFF, SETTLING", _motion(seen)
 
 
-def rotate(seen: Seen, turn: Turn) -> Says:
+def rotate(seen: StepObservation, turn: RotationTracker) -> Says:
     """For the turn."""
     step, limits = seen.step, seen.limits
     whole = abs(step.turn_deg) * DEG
@@ -161,7 +161,7 @@ def rotate(seen: Seen, turn: Turn) -> Says:
                 f"{limits.axis_tilt_deg:g} at most: keep {side(step.up)} up",
             )
         if turn.angle * step.turn_deg < 0.0:
-            return "WRONG WAY", (wrong_way(turn.angle, step),)
+            return "WRONG WAY", (wrong_direction_text(turn.angle, step),)
     done = abs(turn.angle)
     if done + abs(turn.rate) * _AHEAD_S >= whole:
         return "STOP", (f"stop at {abs(step.turn_deg)} deg, hands off",)
@@ -173,7 +173,7 @@ def rotate(seen: Seen, turn: Turn) -> Says:
     return f"ROTATE {step.turn_deg:+d}", plain
 
 
-def _tip(seen: Seen) -> tuple[str, ...]:
+def _tip(seen: StepObservation) -> tuple[str, ...]:
     """Which way to tip the unit so that the right side comes up."""
     want, now, posture = seen.step.up, seen.posture.up, seen.posture
     if now == want:
@@ -194,5 +194,5 @@ def _tip(seen: Seen) -> tuple[str, ...]:
     return hint, f"if its {side(want)} side is up, {cause}: check the certificate"
 
 
-def _motion(seen: Seen) -> tuple[str, ...]:
+def _motion(seen: StepObservation) -> tuple[str, ...]:
     return (f"it moves: {seen.still.why}",) if seen.still.moving else ()

@@ -23,13 +23,13 @@ VERIFICATION: Final = "verification"
 """Step id of the rotation after the result."""
 
 
-class Limits(Model):
+class ProcedureLimits(Model):
     """What poses, rests and rotations have to keep.
 
     `tilt_deg`: how far the upper axis may lean. `heading_deg`: how far the pose may be turned about the
     vertical; 180: any way round. `still_s`: so long it stands still before the alignment. `noise_deg_per_s`
     and `noise_mg`: largest noise of the sensors at rest, rms over 20 ms; what counts as motion follows from
-    the noise that was found. The others are those of `calib.detection.acceptance.Limits`.
+    the noise that was found. The others are those of `calib.detection.acceptance.RotationLimits`.
     """
 
     tilt_deg: Annotated[float, Key(gt=0, le=20)] = 5.0
@@ -110,7 +110,7 @@ class Procedure(Model):
     name: Annotated[str, Key(min_length=1, max_length=80)]
     align_s: Annotated[float, Key(ge=MIN_ALIGNMENT_S, le=MAX_ALIGNMENT_S)] = 370.0
     rest_s: Annotated[float, Key(ge=2, le=600)] = 15.0
-    limits: Limits = Limits()
+    limits: ProcedureLimits = ProcedureLimits()
     poses: Annotated[tuple[Pose, ...], Key(min_length=1, max_length=100)]
 
     @model_validator(mode="after")
@@ -136,8 +136,8 @@ class Procedure(Model):
             for k in range(pose.repeats)
         )
 
-    def rotation_limits(self, step: Step) -> acceptance.Limits:
-        """What the rotation of a step has to keep, as `acceptance.judge` and `runs.collect` take it.
+    def rotation_limits(self, step: Step) -> acceptance.RotationLimits:
+        """Limits of the rotation of a step, as `rejection_reasons` and `navigate_rotations` take them.
 
         Parameters
         ----------
@@ -146,10 +146,10 @@ class Procedure(Model):
 
         Returns
         -------
-        calib.detection.acceptance.Limits
+        calib.detection.acceptance.RotationLimits
         """
         limits = self.limits
-        return acceptance.Limits(
+        return acceptance.RotationLimits(
             angle_deg=abs(step.turn_deg),
             angle_tolerance_deg=limits.angle_tolerance_deg,
             least_peak_deg_per_s=limits.least_peak_deg_per_s,

@@ -13,7 +13,7 @@ class Paragraph:
 
 
 @dataclass(frozen=True)
-class Pairs:
+class KeyValues:
     """What and how much."""
 
     rows: tuple[tuple[str, str], ...]
@@ -29,14 +29,14 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Drawing:
+class Figure:
     """A figure, drawn where it is shown."""
 
     title: str
     draw: Callable[[], bytes]
 
 
-Block: TypeAlias = Paragraph | Pairs | Table | Drawing
+Block: TypeAlias = Paragraph | KeyValues | Table | Figure
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Document:
     sections: tuple[Section, ...]
 
 
-def printable(text: str) -> str:
+def sanitise(text: str) -> str:
     """Text of a file with nothing in it that could steer a terminal."""
     return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
 

@@ -4,7 +4,7 @@ from base64 import b64encode
 from html import escape
 from typing import Final
 
-from calib.reports.document import MARKS, Block, Document, Drawing, Pairs, Paragraph
+from calib.reports.document import MARKS, Block, Document, Figure, KeyValues, Paragraph
 
 LONG: Final = 15
 """A table of more rows may be broken by a page's end."""
@@ -35,13 +35,13 @@ def as_html(document: Document) -> str:
 def _marked_up(block: Block) -> str:
     if isinstance(block, Paragraph):
         return f"<p>{escape(block.text)}</p>\n"
-    if isinstance(block, Drawing):
+    if isinstance(block, Figure):
         image = b64encode(block.draw()).decode()
         return (
             f'<figure><img alt="{escape(block.title)}" src="data:image/svg+xml;base64,{image}">'
             f"<figcaption>{escape(block.title)}</figcaption></figure>\n"
         )
-    if isinstance(block, Pairs):
+    if isinstance(block, KeyValues):
         rows = "".join(
             f'<tr><th class="{name if name in MARKS else "name"}">{escape(name)}</th>'
             f"<td>{escape(value)}</td></tr>\n"

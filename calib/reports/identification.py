@@ -12,12 +12,12 @@ import numpy as np
 from rich.console import RenderableType
 from scipy.special import chdtri
 
-from calib.estimation.result import Identification, Nuisance, RunResult
+from calib.estimation.result import LeverArmEstimate, ParameterEstimate, RunResult
 from calib.estimation.runs import Priors, Run
-from calib.identification import Findings, Source, scatter
-from calib.lever_arms.gauge import Arms
+from calib.identification import CaptureSummary, IdentificationResult, scatter
+from calib.lever_arms.gauge import LeverArms
 from calib.reports import figures
-from calib.reports.document import Block, Document, Drawing, Pairs, Paragraph, Section, Table, printable
+from calib.reports.document import Block, Document, Figure, KeyValues, Paragraph, Section, Table, sanitise
 from calib.reports.format import counted, decimals, three_digits
 from calib.reports.html import as_html
 from calib.reports.text import as_text, blocks_text, for_terminal
@@ -25,7 +25,7 @@ from imudrv.arrays import Array
 from imudrv.units import ARCSEC, DEG, DEG_PER_H, MM, PPM, STANDARD_GRAVITY, UG, URAD
 
 
-def report_text(findings: Findings, arms: Sequence[Arms]) -> str:
+def report_text(findings: IdentificationResult, arms: Sequence[LeverArms]) -> str:
     """Tell the findings as plain text of 80 columns.
 
     Parameters
@@ -43,17 +43,17 @@ def report_text(findings: Findings, arms: Sequence[Arms]) -> str:
     return as_text(_document(findings, arms))
 
 
-def report_for_terminal(findings: Findings, arms: Sequence[Arms]) -> RenderableType:
+def report_for_terminal(findings: IdentificationResult, arms: Sequence[LeverArms]) -> RenderableType:
     """The same for a console of rich's."""
     return for_terminal(_document(findings, arms))
 
 
-def arms_text(arms: Arms) -> str:
+def arms_text(arms: LeverArms) -> str:
     """Tell lever arms alone, with their gauge, as plain text."""
     return blocks_text([_arms_table(arms)])
 
 
-def report_html(findings: Findings, arms: Sequence[Arms]) -> str:
+def report_html(findings: IdentificationResult, arms: Sequence[LeverArms]) -> str:
     """Tell the findings as one HTML file, figures inside, nothing loaded from elsewhere.
 
     Parameters
@@ -69,9 +69,9 @@ def report_html(findings: Findings, arms: Sequence[Arms]) -> str:
     return as_html(_document(findings, arms))
 
 
-def _document(findings: Findings, arms: Sequence[Arms]) -> Document:
+def _document(findings: IdentificationResult, arms: Sequence[LeverArms]) -> Document:
     return Document(
-        f"Inner lever arms of unit {printable(findings.basis.calibration.serial_number)}",
+        f"Inner lever arms of unit {sanitise(findings.basis.calibration.serial_number)}",
         f"Identification of {findings.created:%Y-%m-%d %H:%M} UTC, {findings.software}",
         (
             Section("Result", tuple(_result(findings, arms))),
@@ -85,9 +85,9 @@ def _document(findings: Findings, arms: Sequence[Arms]) -> Document:
     )
 
 
-def _result(findings: Findings, arms: Sequence[Arms]) -> Iterator[Block]:
+def _result(findings: IdentificationResult, arms: Sequence[LeverArms]) -> Iterator[Block]:
     result = findings.result
-    yield Pairs(tuple(verdict(findings)))
+    yield KeyValues(tuple(verdict(findings)))
     yield Paragraph("u is the standard uncertainty (k = 1), U the expanded one (k = 2).")
     for told in arms:
         yield _arms_table(told)
@@ -108,14 +108,14 @@ def _result(findings: Findings, arms: Sequence[Arms]) -> Iterator[Block]:
         ),
     )
     C_ba = findings.basis.calibration.accelerometer.C_ba_array
-    yield Drawing(
+    yield Figure(
         f"Sensing points, gauge {arms[0].gauge}, and sensing directions. Grey cross: origin of b; dot in a "
         "circle: towards the reader, cross in it: away",
         lambda: figures.sensing_points(arms[0].r_b, C_ba),
     )
 
 
-def _arms_table(arms: Arms) -> Table:
+def _arms_table(arms: LeverArms) -> Table:
     """Nine numbers, with their gauge."""
     head: tuple[str, ...] = ("", "X", "Y", "Z")
     values = arms.r_b / MM
@@ -138,7 +138,7 @@ def _arms_table(arms: Arms) -> Table:
     )
 
 
-def verdict(findings: Findings) -> Iterator[tuple[str, str]]:
+def verdict(findings: IdentificationResult) -> Iterator[tuple[str, str]]:
     """Judge the findings.
 
     Parameters
@@ -163,16 +163,18 @@ def verdict(findings: Findings) -> Iterator[tuple[str, str]]:
     if result.consistent:
         yield _agreement(result)
     for refusal in result.refusals:
-        yield "bad", f"{printable(refusal[0].upper() + refusal[1:])}. No certificate is made."
+        yield "bad", f"{sanitise(refusal[0].upper() + refusal[1:])}. No certificate is made."
     shifts = [
-        (one.label, float(np.abs(one.shift_m).max())) for one in result.left_out if one.shift_m is not None
+        (one.label, float(np.abs(one.shift_m).max()))
+        for one in result.leave_one_out
+        if one.shift_m is not None
     ]
     if shifts:
         label, shift = max(shifts, key=lambda item: item[1])
         yield (
             "note",
             f"Leaving out one rotation changes no component by more than {shift / MM:.3f} mm "
-            f"({printable(label)}).",
+            f"({sanitise(label)}).",
         )
     else:
         yield (
@@ -180,7 +182,7 @@ def verdict(findings: Findings) -> Iterator[tuple[str, str]]:
             "The arms are determined, not checked: no redundant rotation. A second set, turned the other "
             "way, checks them.",
         )
-    for n in result.nuisances:
+    for n in result.parameters:
         if n.name == "skew_s" and not n.seen:
             yield (
                 "note",
@@ -189,12 +191,12 @@ def verdict(findings: Findings) -> Iterator[tuple[str, str]]:
             )
     for k, run in enumerate(findings.runs):
         if run.aligned.motion is not None:
-            yield "caution", f"Run {k + 1} moved while it was aligned: {printable(run.aligned.motion)}."
+            yield "caution", f"Run {k + 1} moved while it was aligned: {sanitise(run.aligned.motion)}."
     for note in result.notes:
-        yield "caution", f"{printable(note)}."
+        yield "caution", f"{sanitise(note)}."
 
 
-def _agreement(result: Identification) -> tuple[str, str]:
+def _agreement(result: LeverArmEstimate) -> tuple[str, str]:
     n = result.degrees_of_freedom
     if n == 0:
         return "caution", "As many equations as unknowns: no residuals, nothing to judge the model by."
@@ -220,13 +222,13 @@ def _agreement(result: Identification) -> tuple[str, str]:
     return "good", f"The velocities agree with the model: {told}."
 
 
-def _measured(findings: Findings) -> Iterator[Block]:
+def _measured(findings: IdentificationResult) -> Iterator[Block]:
     basis, site, result = findings.basis, findings.site, findings.result
     gravity = "normal gravity" if site.gravity_m_s2 is None else f"gravity {site.gravity_m_s2:.6f} m/s^2"
-    yield Pairs(
+    yield KeyValues(
         (
-            ("unit", printable(basis.calibration.serial_number)),
-            ("calibration", f"{printable(basis.name)} of {basis.calibration.created:%Y-%m-%d}"),
+            ("unit", sanitise(basis.calibration.serial_number)),
+            ("calibration", f"{sanitise(basis.name)} of {basis.calibration.created:%Y-%m-%d}"),
             ("SHA-256", basis.sha256),
             (
                 "site",
@@ -243,9 +245,9 @@ def _measured(findings: Findings) -> Iterator[Block]:
             for channel, least, most in source.temperatures
         )
         parts = [source.name, source.profile] + ([f"channel {source.channel}"] if source.channel else [])
-        yield Pairs(
+        yield KeyValues(
             (
-                ("capture", printable(", ".join(parts))),
+                ("capture", sanitise(", ".join(parts))),
                 ("SHA-256", source.sha256),
                 ("contents", f"{source.evidence.segments.duration_s:.1f} s; {source.books}"),
                 ("temperature", f"{warm} degC" if warm else "not told by the unit"),
@@ -253,7 +255,7 @@ def _measured(findings: Findings) -> Iterator[Block]:
         )
 
 
-def _rotations(findings: Findings) -> Iterator[Block]:
+def _rotations(findings: IdentificationResult) -> Iterator[Block]:
     limits = findings.limits
     yield Paragraph(
         f"A rotation serves if it turns {limits.angle_deg:g} +- {limits.angle_tolerance_deg:g} deg, with a "
@@ -267,9 +269,9 @@ def _rotations(findings: Findings) -> Iterator[Block]:
         before, after = rotation.before, rotation.after
         assert before is not None
         assert after is not None
-        yield Pairs(
+        yield KeyValues(
             (
-                (f"run {k + 1}", printable(run.label)),
+                (f"run {k + 1}", sanitise(run.label)),
                 (
                     "rotation",
                     f"{rotation.angle_deg:+.2f} deg about {rotation.axis} up, {rotation.duration_s:.2f} s, "
@@ -287,7 +289,7 @@ def _rotations(findings: Findings) -> Iterator[Block]:
                     f"{aligned.duration_s:.1f} s: heading {aligned.heading_rad / DEG:.3f} deg, u "
                     f"{aligned.heading_sigma_rad / DEG:.3f} deg; level u "
                     f"{aligned.level_sigma_rad / ARCSEC:.1f} arcsec; "
-                    f"{printable(aligned.motion) if aligned.motion else 'stood still'}",
+                    f"{sanitise(aligned.motion) if aligned.motion else 'stood still'}",
                 ),
                 ("verdict", "serves: within all limits"),
             )
@@ -304,7 +306,7 @@ def _rotations(findings: Findings) -> Iterator[Block]:
                 ),
             ),
         )
-        yield Drawing(
+        yield Figure(
             f"Run {k + 1}. Grey: the rotation. A constant offset is that of the first velocity, from pulses",
             _drawn(run, told),
         )
@@ -314,14 +316,14 @@ def _drawn(run: Run, told: RunResult) -> Callable[[], bytes]:
     return lambda: figures.velocities(run, told)
 
 
-def _rejected(sources: Sequence[Source]) -> Iterator[Block]:
+def _rejected(sources: Sequence[CaptureSummary]) -> Iterator[Block]:
     rejected = [(source.name, *one) for source in sources for one in source.evidence.rejected]
     for name, rotation, reasons in rejected:
-        yield Pairs(
+        yield KeyValues(
             (
                 (
                     "motion",
-                    f"{printable(name)} from {rotation.start_s:.1f} to {rotation.stop_s:.1f} s, "
+                    f"{sanitise(name)} from {rotation.start_s:.1f} to {rotation.stop_s:.1f} s, "
                     f"{rotation.angle_deg:+.1f} deg about {rotation.axis} up",
                 ),
                 *(("rejected", reason) for reason in reasons),
@@ -331,7 +333,7 @@ def _rejected(sources: Sequence[Source]) -> Iterator[Block]:
         yield Paragraph("None: every motion in the captures serves.")
 
 
-def _velocities(result: Identification) -> Iterator[Block]:
+def _velocities(result: LeverArmEstimate) -> Iterator[Block]:
     def size(v_n: Array) -> float:
         return hypot(v_n[0], v_n[1]) / MM
 
@@ -340,7 +342,7 @@ def _velocities(result: Identification) -> Iterator[Block]:
         ("run", "measured", "left", "ratio", "scatter"),
         tuple(
             (
-                f"{k + 1}  {printable(run.label)}",
+                f"{k + 1}  {sanitise(run.label)}",
                 f"{size(run.V_n):.2f}",
                 f"{size(run.compensated_n):.2f}",
                 f"{size(run.compensated_n) / size(run.V_n):.1%}",
@@ -353,12 +355,12 @@ def _velocities(result: Identification) -> Iterator[Block]:
         "'Left' is V - H R, the size effect taken off and nothing else: what remains is residual bias, tilt "
         "and misalignment. 'Scatter' is the rms of the residuals at rest about their mean."
     )
-    yield Drawing(
+    yield Figure(
         "Horizontal velocity before and after compensation", lambda: figures.before_after(result.runs)
     )
 
 
-def _estimate(findings: Findings) -> Iterator[Block]:
+def _estimate(findings: IdentificationResult) -> Iterator[Block]:
     result, priors = findings.result, findings.priors
     yield Paragraph(f"Observability. {result.reason[:1].upper()}{result.reason[1:]}.")
     yield Table(
@@ -369,13 +371,13 @@ def _estimate(findings: Findings) -> Iterator[Block]:
             ("s", *(three_digits(s) for s in result.singular_values)),
         ),
     )
-    yield Drawing(
+    yield Figure(
         f"Standard uncertainty of each direction; worse than {priors.arm / MM:g} mm is not seen",
         lambda: figures.directions(result.direction_sigma, result.rank, priors.arm),
     )
     yield Paragraph(f"Consistency. {_agreement(result)[1]}")
     noise = result.noise
-    yield Pairs(
+    yield KeyValues(
         (
             (
                 "gyros",
@@ -388,22 +390,22 @@ def _estimate(findings: Findings) -> Iterator[Block]:
             ),
         )
     )
-    yield Table("What was taken to be known before", ("", "u"), tuple(priors_told(priors)))
-    if result.nuisances:
+    yield Table("What was taken to be known before", ("", "u"), tuple(priors_rows(priors)))
+    if result.parameters:
         names = _names(result)
         yield Table(
             "Estimated beside the arms",
             ("", "value", "u", "u before", ""),
-            tuple(_nuisance(n, words) for n, words in zip(result.nuisances, names, strict=True)),
+            tuple(_nuisance(n, words) for n, words in zip(result.parameters, names, strict=True)),
         )
         yield _correlations(findings, names)
-    if result.left_out:
+    if result.leave_one_out:
         yield Table(
             "Each rotation left out in turn: largest change of r_x, r_y, r_z, mm",
             ("without", "rank", "r_x", "r_y", "r_z"),
             tuple(
                 (
-                    printable(one.label),
+                    sanitise(one.label),
                     str(one.rank),
                     *(
                         ("not seen",) * 3
@@ -411,12 +413,12 @@ def _estimate(findings: Findings) -> Iterator[Block]:
                         else (f"{np.abs(row).max() / MM:.3f}" for row in one.shift_m)
                     ),
                 )
-                for one in result.left_out
+                for one in result.leave_one_out
             ),
         )
 
 
-def _correlations(findings: Findings, names: Sequence[str]) -> Table:
+def _correlations(findings: IdentificationResult, names: Sequence[str]) -> Table:
     correlation = findings.differences_correlation
     largest = np.argsort(-np.abs(correlation), axis=1)[:, :2]
     return Table(
@@ -432,7 +434,7 @@ def _correlations(findings: Findings, names: Sequence[str]) -> Table:
     )
 
 
-def _limits(findings: Findings, arms: Arms) -> Iterator[str]:
+def _limits(findings: IdentificationResult, arms: LeverArms) -> Iterator[str]:
     result = findings.result
     if result.gauge != "given":
         yield (
@@ -459,7 +461,7 @@ def _limits(findings: Findings, arms: Arms) -> Iterator[str]:
     )
 
 
-def priors_told(priors: Priors) -> Iterator[tuple[str, str]]:
+def priors_rows(priors: Priors) -> Iterator[tuple[str, str]]:
     """Priors in the units of the field: what, and how much."""
     yield "accelerometer bias", f"{priors.accelerometer_bias / UG:g} ug"
     yield "accelerometer scale", f"{priors.accelerometer_scale / PPM:g} ppm"
@@ -470,18 +472,18 @@ def priors_told(priors: Priors) -> Iterator[tuple[str, str]]:
     yield "gyro-accelerometer skew", f"{priors.skew * 1e3:g} ms"
 
 
-def _names(result: Identification) -> list[str]:
+def _names(result: LeverArmEstimate) -> list[str]:
     """Names of the nuisances in words, runs by their numbers."""
     runs = {f"phi {run.label}": f"run {k + 1}" for k, run in enumerate(result.runs)}
     tilts = {"east": "tilt about east", "north": "tilt about north", "up": "heading"}
     names = []
-    for nuisance in result.nuisances:
+    for nuisance in result.parameters:
         head, _, part = nuisance.name.rpartition("_")
         names.append(f"{runs[head]} {tilts[part]}" if head in runs else nuisance.name.replace("_", " "))
     return names
 
 
-def _nuisance(n: Nuisance, words: str) -> tuple[str, ...]:
+def _nuisance(n: ParameterEstimate, words: str) -> tuple[str, ...]:
     unit, factor = _unit(n.name)
     return (words, *(three_digits(value / factor) for value in (n.value, n.sigma, n.prior)), unit)
 

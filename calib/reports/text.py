@@ -11,7 +11,7 @@ from rich.padding import Padding
 from rich.table import Table as RichTable
 from rich.text import Text as RichText
 
-from calib.reports.document import MARKS, Block, Document, Drawing, Pairs, Paragraph
+from calib.reports.document import MARKS, Block, Document, Figure, KeyValues, Paragraph
 
 WIDTH: Final = 80
 """Columns of the text."""
@@ -47,11 +47,11 @@ def _text(shown: RenderableType) -> str:
 
 
 def _shown(block: Block) -> Iterator[RenderableType]:
-    if isinstance(block, Drawing):
+    if isinstance(block, Figure):
         return
     if isinstance(block, Paragraph):
         yield Padding(RichText(block.text), (0, 0, 1, 2))
-    elif isinstance(block, Pairs):
+    elif isinstance(block, KeyValues):
         grid = RichTable.grid(padding=(0, 2, 0, 0))
         grid.add_column()
         grid.add_column(overflow="fold")

@@ -4,13 +4,13 @@ from collections.abc import Iterator, Sequence
 from math import isnan, nan
 
 from calib.reports import figures
-from calib.reports.document import Block, Document, Drawing, Pairs, Paragraph, Section, Table, printable
+from calib.reports.document import Block, Document, Figure, KeyValues, Paragraph, Section, Table, sanitise
 from calib.validation.trial import FAST_DEG_PER_S, FIRST_S, Trial
-from calib.validation.verdict import SAME, SMALLER, Judged
+from calib.validation.verdict import MAX_CHANGE, MIN_REDUCTION, TrialMetrics
 from imudrv.units import MM
 
 
-def document(unit: str, trials: Sequence[tuple[Trial, Judged]], drawn: int) -> Document:
+def document(unit: str, trials: Sequence[tuple[Trial, TrialMetrics]], drawn: int) -> Document:
     """Tell trials.
 
     Parameters
@@ -27,44 +27,44 @@ def document(unit: str, trials: Sequence[tuple[Trial, Judged]], drawn: int) -> D
     Document
     """
     return Document(
-        f"Validation of {printable(unit)}",
+        f"Validation of {sanitise(unit)}",
         "Velocity at rest, in error: Normal without, Compensation with the size effect taken off",
         (
             Section("Verdicts", tuple(_verdicts(trials))),
             Section("What is compared", tuple(Paragraph(text) for text in _compared())),
-            *(Section(printable(trial.name), tuple(_one(trial, judged))) for trial, judged in trials[:drawn]),
+            *(Section(sanitise(trial.name), tuple(_one(trial, judged))) for trial, judged in trials[:drawn]),
         ),
     )
 
 
-def verdict(trial: Trial, judged: Judged) -> tuple[str, str]:
+def verdict(trial: Trial, judged: TrialMetrics) -> tuple[str, str]:
     """Judge a trial: 'good' or 'bad', and why, in a sentence."""
     mark = "good" if judged.good else "bad"
     if judged.expected == "smaller":
         return mark, (
-            f"{printable(trial.name)}: horizontal velocity right after the motion "
+            f"{sanitise(trial.name)}: horizontal velocity right after the motion "
             f"{judged.first[0] / MM:.2f} mm/s without, {judged.first[1] / MM:.2f} mm/s with compensation: "
-            f"{judged.smaller_by:.2%} smaller, want {SMALLER:.0%}."
+            f"{judged.smaller_by:.2%} smaller, want {MIN_REDUCTION:.0%}."
         )
     return mark, (
-        f"{printable(trial.name)}: compensation changes the horizontal velocity by {judged.change / MM:.3f} "
-        f"mm/s rms; want less than {SAME:.0%} of the {judged.whole[0] / MM:.3f} mm/s without it, and less "
-        f"than the {judged.noise / MM:.3f} mm/s of the sensors' noise."
+        f"{sanitise(trial.name)}: compensation changes the horizontal velocity by {judged.change / MM:.3f} "
+        f"mm/s rms; want less than {MAX_CHANGE:.0%} of the {judged.whole[0] / MM:.3f} mm/s without it, and "
+        f"less than the {judged.noise / MM:.3f} mm/s of the sensors' noise."
     )
 
 
-def _verdicts(trials: Sequence[tuple[Trial, Judged]]) -> Iterator[Block]:
-    yield Pairs(tuple(verdict(trial, judged) for trial, judged in trials))
+def _verdicts(trials: Sequence[tuple[Trial, TrialMetrics]]) -> Iterator[Block]:
+    yield KeyValues(tuple(verdict(trial, judged) for trial, judged in trials))
     moved = [(trial, course) for trial, _ in trials if (course := trial.normal.aligned.motion)]
     if moved:
-        yield Pairs(tuple(("caution", printable(f"{trial.name}: {how}")) for trial, how in moved))
+        yield KeyValues(tuple(("caution", sanitise(f"{trial.name}: {how}")) for trial, how in moved))
     yield Table(
         f"Horizontal velocity, mm/s: mean over {FIRST_S:g} s right after the motion; then rms apart from the "
         "twin over all the rest after it",
         ("", "Normal", "Comp.", "twin", "smaller", "Normal", "Comp."),
         tuple(
             (
-                printable(trial.name),
+                sanitise(trial.name),
                 *(_mm(v) for v in judged.first),
                 f"{judged.smaller_by:.2%}" if judged.expected == "smaller" else "",
                 *(_mm(v) for v in judged.effect),
@@ -93,7 +93,7 @@ def _compared() -> Iterator[str]:
     )
 
 
-def _one(trial: Trial, judged: Judged) -> Iterator[Block]:
+def _one(trial: Trial, judged: TrialMetrics) -> Iterator[Block]:
     yield Table(
         f"Velocity right after the motion, mean over {FIRST_S:g} s, mm/s",
         ("", "east", "north", "up"),
@@ -116,8 +116,8 @@ def _one(trial: Trial, judged: Judged) -> Iterator[Block]:
             )
         ),
     )
-    yield Drawing(
-        f"{printable(trial.name)}: velocity error; grey: the motion, where velocity is not zero",
+    yield Figure(
+        f"{sanitise(trial.name)}: velocity error; grey: the motion, where velocity is not zero",
         lambda: figures.courses(trial.t_s, trial.normal.v_n, trial.compensated.v_n, trial.moved_s),
     )
 

@@ -32,7 +32,7 @@ from calib.detection.noise import pooled_noise
 from calib.detection.segments import Segments, find_segments
 from calib.estimation.runs import GUARD_S, Priors
 from calib.validation.skew import SkewCorrection
-from calib.validation.trial import BEFORE_S, FIRST_S, Course, Setting, Trial
+from calib.validation.trial import BEFORE_S, FIRST_S, NavigatedVelocity, Trial, TrialSettings
 from imudrv.arrays import Array
 from imudrv.errors import InputError
 from imudrv.imu.coefficients import Coefficients
@@ -46,7 +46,7 @@ from imudrv.units import NS
 
 
 def navigate(
-    name: str, pulses: Iterable[Records], setting: Setting, twin: Iterable[Records] | None = None
+    name: str, pulses: Iterable[Records], setting: TrialSettings, twin: Iterable[Records] | None = None
 ) -> Trial:
     """Navigate pulses twice, side by side.
 
@@ -71,7 +71,10 @@ def navigate(
         The first rest is too short for the alignment, or none follows the motion.
     """
     known = setting.known()
-    normal, compensated = _Chain(setting, replace(known, r_b=None)), _Chain(setting, known)
+    normal, compensated = (
+        _NavigationChain(setting, replace(known, r_b=None)),
+        _NavigationChain(setting, known),
+    )
 
     def passing() -> Iterator[Records]:
         for piece in pulses:
@@ -88,9 +91,9 @@ def navigate(
     return Trial(
         name,
         t_s=BLOCK_NS * NS * (np.arange(n, dtype=np.float64) + 0.5),
-        normal=Course(normal.aligned(), v_n[0][:n]),
-        compensated=Course(compensated.aligned(), v_n[1][:n]),
-        twin=None if twin is None else _alone(setting, known, twin, n),
+        normal=NavigatedVelocity(normal.aligned(), v_n[0][:n]),
+        compensated=NavigatedVelocity(compensated.aligned(), v_n[1][:n]),
+        twin=None if twin is None else _navigate_twin(setting, known, twin, n),
         moved_s=moved_s,
         peak_deg_per_s=max((rotation.peak_deg_per_s for rotation in segments.rotations), default=0.0),
         noise=pooled_noise(rest.differences for rest in segments.rests),
@@ -115,18 +118,20 @@ def _motion(name: str, segments: Segments, align_s: float) -> tuple[float, float
     return rest_s - align_s, rotations[-1].stop_s - align_s
 
 
-def _alone(setting: Setting, known: Coefficients, pulses: Iterable[Records], n: int) -> Course:
-    chain = _Chain(replace(setting, skew_s=0.0), replace(known, r_b=None))
+def _navigate_twin(
+    setting: TrialSettings, known: Coefficients, pulses: Iterable[Records], n: int
+) -> NavigatedVelocity:
+    chain = _NavigationChain(replace(setting, skew_s=0.0), replace(known, r_b=None))
     for piece in pulses:
         chain.feed(piece)
     chain.close()
-    return Course(chain.aligned(), chain.v_n()[:n])
+    return NavigatedVelocity(chain.aligned(), chain.v_n()[:n])
 
 
-class _Chain:
+class _NavigationChain:
     """Pulses to velocities: compensate, put a skew right, align, navigate."""
 
-    def __init__(self, setting: Setting, known: Coefficients) -> None:
+    def __init__(self, setting: TrialSettings, known: Coefficients) -> None:
         site, layout = setting.site, setting.layout
         self._site = site
         self._compensator = Compensator(known, layout, rate_filter(setting.rate_filter, layout.interval_ns))

@@ -12,14 +12,14 @@ from typing import Any, Final
 
 import numpy as np
 
-from calib.certificate import FOUND, with_arms
-from calib.detection.acceptance import Limits
-from calib.estimation.joint import joint
-from calib.estimation.result import Identification
-from calib.estimation.runs import Run, collect
-from calib.lever_arms.gauge import Arms
+from calib.certificate import PROVENANCE_IDENTIFIED, with_lever_arms
+from calib.detection.acceptance import RotationLimits
+from calib.estimation.joint import estimate_joint
+from calib.estimation.result import LeverArmEstimate
+from calib.estimation.runs import Run, navigate_rotations
+from calib.lever_arms.gauge import LeverArms
 from calib.validation.navigate import navigate
-from calib.validation.trial import RATE_FILTER, Setting, Trial
+from calib.validation.trial import RATE_FILTER, Trial, TrialSettings
 from imudrv import profiles
 from imudrv.arrays import Array
 from imudrv.calibration import Accelerometer, Calibration, Gyro, SensingPoints, SizeEffect, coefficients
@@ -29,7 +29,7 @@ from imudrv.nav.alignment import ALIGNMENT_S
 from imudrv.records import Flag, Records
 from imudrv.sim import scenario as scenarios
 from imudrv.sim.scenario import NOMINAL, Residuals, Rest, Scenario, Segment, Unit
-from imudrv.sim.unit import draw, simulate
+from imudrv.sim.unit import draw_true_unit, simulate
 from imudrv.units import ARCSEC, DEG_PER_H, UG
 
 PROFILE: Final = "imu50-rs422"
@@ -51,7 +51,7 @@ BEFORE_S: Final = 10.0
 
 
 @dataclass(frozen=True)
-class Subject:
+class SimulatedUnit:
     """A unit, and what the procedure found of it.
 
     Attributes
@@ -68,11 +68,11 @@ class Subject:
 
     real: Calibration
     found: Calibration
-    result: Identification
+    result: LeverArmEstimate
     skew_s: float
 
 
-def subject(unit: Unit, seed: int, *, procedure: Sequence[str] = PROCEDURE) -> Subject:
+def subject(unit: Unit, seed: int, *, procedure: Sequence[str] = PROCEDURE) -> SimulatedUnit:
     """Draw a unit and run the procedure with it.
 
     Parameters
@@ -89,19 +89,24 @@ def subject(unit: Unit, seed: int, *, procedure: Sequence[str] = PROCEDURE) -> S
     Subject
     """
     came_with = (unit.calibration or NOMINAL).model_copy(update={"size_effect": None})
-    real = really(unit, seed)
+    real = true_calibration(unit, seed)
     built = unit.model_copy(update={"calibration": real, "residuals": Residuals()})
     runs = [run for k, name in enumerate(procedure) for run in _evidence(name, built, [seed, k], came_with)]
-    result = joint(runs)
-    skew_s = next(n.value for n in result.nuisances if n.name == "skew_s")
-    arms = Arms(result.R_b, result.covariance, result.gauge)
-    return Subject(real, with_arms(came_with, arms, FOUND, {"method": result.method}), result, skew_s)
+    result = estimate_joint(runs)
+    skew_s = next(n.value for n in result.parameters if n.name == "skew_s")
+    arms = LeverArms(result.R_b, result.covariance, result.gauge)
+    return SimulatedUnit(
+        real,
+        with_lever_arms(came_with, arms, PROVENANCE_IDENTIFIED, {"method": result.method}),
+        result,
+        skew_s,
+    )
 
 
-def really(unit: Unit, seed: int) -> Calibration:
+def true_calibration(unit: Unit, seed: int) -> Calibration:
     """The unit that a seed draws, as a calibration that would leave no error."""
     nominal = unit.calibration or NOMINAL
-    drawn = draw(scenarios.load(PROCEDURE[0]).model_copy(update={"unit": unit, "seed": seed}))
+    drawn = draw_true_unit(scenarios.load(PROCEDURE[0]).model_copy(update={"unit": unit, "seed": seed}))
     return nominal.model_copy(
         update={
             "gyro": Gyro(
@@ -143,7 +148,7 @@ def scenario(name: str, align_s: float = ALIGNMENT_S) -> Scenario:
 def trial(
     label: str,
     of: Scenario,
-    who: Subject,
+    who: SimulatedUnit,
     seed: int,
     *,
     align_s: float = ALIGNMENT_S,
@@ -177,7 +182,7 @@ def trial(
     unit = of.unit.model_copy(update={"calibration": who.real, "residuals": Residuals()})
     run = of.model_copy(update={"seed": _seed([seed, len(PROCEDURE)]), "unit": unit})
     layout = profiles.load(PROFILE).layout()
-    setting = Setting(layout, who.found, run.site, align_s, filter_name, skew_s)
+    setting = TrialSettings(layout, who.found, run.site, align_s, filter_name, skew_s)
     return navigate(label, _pulses(run, layout.interval_ns), setting, _pulses(_twin(run), layout.interval_ns))
 
 
@@ -210,7 +215,7 @@ def campaign(
             yield trial(f"{name}, unit {seed}", scenario(name), who, seed, filter_name=filter_name)
 
 
-def askew(seed: int) -> Iterator[Trial]:
+def skew_trials(seed: int) -> Iterator[Trial]:
     """Rocking with accelerometers whose sample ends `SKEW_S` too late: ignored, and estimated and put right.
 
     Half turns about the vertical do not show a skew, for they leave gravity where it is; the evidence is the
@@ -235,7 +240,7 @@ def askew(seed: int) -> Iterator[Trial]:
     yield trial(label, rocking, who, seed, skew_s=who.skew_s)
 
 
-def dithering(seed: int) -> Iterator[Trial]:
+def dither_trials(seed: int) -> Iterator[Trial]:
     """The rotation with the blocks' dither left in the gyros' increments, with two rate filters.
 
     The arms are those found while the unit took its dither out.
@@ -277,7 +282,7 @@ def _twin(run: Scenario) -> Scenario:
     return run.model_copy(update={"unit": unit})
 
 
-ANY_MOTION: Final = Limits(
+ANY_MOTION: Final = RotationLimits(
     angle_deg=0.0, angle_tolerance_deg=1e9, least_peak_deg_per_s=0.0, axis_tilt_deg=90.0
 )
 """A motion that is evidence without being a half turn, such as rocking, has to keep these."""
@@ -288,7 +293,7 @@ def _evidence(name: str, unit: Unit, seed: list[int], known: Calibration) -> tup
     layout = profiles.load(PROFILE).layout()
     run = scenarios.load(name).model_copy(update={"unit": unit, "seed": _seed(seed)})
     bare = coefficients(known)
-    limits = Limits() if name in PROCEDURE else ANY_MOTION
+    limits = RotationLimits() if name in PROCEDURE else ANY_MOTION
 
     def increments() -> Iterator[Records]:
         compensator = Compensator(bare, layout, rate_filter("causal", layout.interval_ns))
@@ -296,7 +301,7 @@ def _evidence(name: str, unit: Unit, seed: list[int], known: Calibration) -> tup
             yield compensator.feed(pulses)
 
     captured = list(_pulses(run, layout.interval_ns))
-    return collect(increments, bare.C_ba, run.site, label=name, limits=limits).runs
+    return navigate_rotations(increments, bare.C_ba, run.site, label=name, limits=limits).runs
 
 
 def _rows(matrix: Array) -> Any:

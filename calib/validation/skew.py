@@ -5,7 +5,7 @@ from math import floor
 
 import numpy as np
 
-from calib.validation.trial import Setting
+from calib.validation.trial import TrialSettings
 from imudrv.errors import InputError
 from imudrv.imu.coefficients import Coefficients
 from imudrv.imu.compensation import Compensator
@@ -21,7 +21,7 @@ class SkewCorrection:
     samples around tells it (Lagrange). The size effect is that of the gyros' own time and is not moved.
     """
 
-    def __init__(self, setting: Setting, known: Coefficients) -> None:
+    def __init__(self, setting: TrialSettings, known: Coefficients) -> None:
         layout = setting.layout
         self._interval_ns = layout.interval_ns
         self._bare = Compensator(

@@ -6,7 +6,7 @@ from typing import Final, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.certificate import arms_of
+from calib.certificate import lever_arms_of
 from calib.detection.noise import Noise
 from calib.estimation.runs import GUARD_S
 from calib.lever_arms.gauge import convert
@@ -38,7 +38,7 @@ BEFORE_S: Final = 5.0
 
 
 @dataclass(frozen=True)
-class Setting:
+class TrialSettings:
     """How pulses become velocities.
 
     Attributes
@@ -66,12 +66,12 @@ class Setting:
 
     def known(self) -> Coefficients:
         """The calibration, its lever arms told from their centroid."""
-        r_b = convert(arms_of(self.calibration, "validation"), "centroid").r_b
+        r_b = convert(lever_arms_of(self.calibration, "validation"), "centroid").r_b
         return replace(coefficients(self.calibration), r_b=r_b)
 
 
 @dataclass(frozen=True)
-class Course:
+class NavigatedVelocity:
     """One navigation.
 
     Attributes
@@ -112,9 +112,9 @@ class Trial:
 
     name: str
     t_s: Array
-    normal: Course
-    compensated: Course
-    twin: Course | None
+    normal: NavigatedVelocity
+    compensated: NavigatedVelocity
+    twin: NavigatedVelocity | None
     moved_s: tuple[float, float] | None
     peak_deg_per_s: float
     noise: Noise

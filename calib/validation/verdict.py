@@ -10,16 +10,16 @@ from calib.validation.trial import FIRST_S, Expected, Trial
 from imudrv.arrays import Array
 from imudrv.nav.earth import SEMI_MAJOR_AXIS
 
-SMALLER: Final = 0.95
+MIN_REDUCTION: Final = 0.95
 """By so much compensation has to make the velocity after a fast motion smaller."""
 
 
-SAME: Final = 0.05
+MAX_CHANGE: Final = 0.05
 """So much of the velocity it may change where nothing turns fast."""
 
 
 @dataclass(frozen=True)
-class Judged:
+class TrialMetrics:
     """A trial in figures; m/s, horizontal where it is not said otherwise.
 
     Attributes
@@ -61,11 +61,11 @@ class Judged:
     def good(self) -> bool:
         """Whether compensation does what it should."""
         if self.expected == "smaller":
-            return self.smaller_by >= SMALLER
-        return self.change < min(SAME * self.whole[0], self.noise)
+            return self.smaller_by >= MIN_REDUCTION
+        return self.change < min(MAX_CHANGE * self.whole[0], self.noise)
 
 
-def judge(trial: Trial) -> Judged:
+def evaluate(trial: Trial) -> TrialMetrics:
     """Put a trial into figures.
 
     Parameters
@@ -83,7 +83,7 @@ def judge(trial: Trial) -> Judged:
     floor_v = np.full_like(v[0], np.nan) if trial.twin is None else trial.twin.v_n
     mean = [one[first].mean(axis=0) for one in (*v, floor_v)]
     noise = noise_velocity(trial.t_s[after], trial.noise, trial.gravity)
-    return Judged(
+    return TrialMetrics(
         trial.expected,
         before=(_rms(v[0][before]), _rms(v[1][before])) if before.any() else (np.nan, np.nan),
         first=(_speed(mean[0]), _speed(mean[1]), _speed(mean[2])),

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from imudrv.doctor.verdict import Step, Verdict
+from imudrv.doctor.verdict import Finding, Verdict
 from imudrv.service.runtime import PRIORITY
 
 RULES: Final = "tools/99-imu50.rules"
@@ -36,7 +36,7 @@ class System:
     dev: Path = Path("/dev")
 
 
-def limits() -> Iterator[Step]:
+def limits() -> Iterator[Finding]:
     """Whether a real-time place and locked memory would be granted to this user."""
     for name, limit, enough, key, unit in (
         ("real-time priority", resource.RLIMIT_RTPRIO, PRIORITY, "rtprio 50", "LimitRTPRIO=50"),
@@ -45,9 +45,9 @@ def limits() -> Iterator[Step]:
         soft, _ = resource.getrlimit(limit)
         unlimited = soft == resource.RLIM_INFINITY
         if os.geteuid() == 0 or unlimited or (enough is not None and soft >= enough):
-            yield Step(name, Verdict.OK, "--realtime would get it")
+            yield Finding(name, Verdict.OK, "--realtime would get it")
         else:
-            yield Step(
+            yield Finding(
                 name,
                 Verdict.WARN,
                 f"the limit is {soft}: --realtime would be refused; only a loaded machine needs it",
@@ -60,11 +60,11 @@ def _user() -> str:
     return os.environ.get("USER", "YOUR_NAME")
 
 
-def device_steps(device: Path, system: System) -> Iterator[Step]:
+def device_steps(device: Path, system: System) -> Iterator[Finding]:
     """Examine the device of a serial port."""
     if not device.exists():
         there = [str(path) for path in candidates(system)]
-        yield Step(
+        yield Finding(
             "device",
             Verdict.FAIL,
             f"there is no {device}",
@@ -74,12 +74,12 @@ def device_steps(device: Path, system: System) -> Iterator[Step]:
         )
         return
     target = device.resolve()
-    yield Step("device", Verdict.OK, str(device) if target == device else f"{device} is {target}")
+    yield Finding("device", Verdict.OK, str(device) if target == device else f"{device} is {target}")
     if os.access(device, os.R_OK | os.W_OK):
-        yield Step("permission", Verdict.OK, "this user may open it")
+        yield Finding("permission", Verdict.OK, "this user may open it")
     else:
         group = _group(device)
-        yield Step(
+        yield Finding(
             "permission",
             Verdict.FAIL,
             f"this user may not open {device}; the group {group} may",
@@ -88,14 +88,14 @@ def device_steps(device: Path, system: System) -> Iterator[Step]:
         return
     there_are, all_seen = holders(target, system)
     if there_are:
-        yield Step(
+        yield Finding(
             "busy",
             Verdict.FAIL,
             f"open in {', '.join(there_are)}: each program would get a part of the bytes",
             "end that program",
         )
     else:
-        yield Step(
+        yield Finding(
             "busy",
             Verdict.OK,
             "nobody has it open" if all_seen else "none of this user's programs has it open",
@@ -140,21 +140,23 @@ def _group(device: Path) -> str:
         return str(number)
 
 
-def interface_step(name: str, system: System) -> Step:
+def interface_step(name: str, system: System) -> Finding:
     """Examine a CAN interface."""
     there = system.sys / "class" / "net" / name
     if not there.exists():
         others = sorted(path.name for path in there.parent.glob("*can*"))
         found = f"there is no CAN interface {name}" + (f", but {', '.join(others)}" if others else "")
-        return Step("interface", Verdict.FAIL, found, "plug the adapter in, or load its driver")
+        return Finding("interface", Verdict.FAIL, found, "plug the adapter in, or load its driver")
     flags = int(_read(there / "flags") or "0", 16)
     if not flags & _IFF_UP:
         fix = f"sudo ip link set {name} up type can bitrate 1000000 (for CAN FD: dbitrate 5000000 fd on)"
-        return Step("interface", Verdict.FAIL, f"{name} is down", fix)
-    return Step("interface", Verdict.OK, f"{name} is up; `ip -details link show {name}` tells its bit rate")
+        return Finding("interface", Verdict.FAIL, f"{name} is down", fix)
+    return Finding(
+        "interface", Verdict.OK, f"{name} is up; `ip -details link show {name}` tells its bit rate"
+    )
 
 
-def usb(name: str, system: System) -> Iterator[Step]:
+def usb(name: str, system: System) -> Iterator[Finding]:
     """What an adapter's driver does to latency.
 
     Parameters
@@ -173,7 +175,7 @@ def usb(name: str, system: System) -> Iterator[Step]:
     latency_ms = _read(timer)
     if latency_ms.isdigit():
         slow = int(latency_ms) > 1
-        yield Step(
+        yield Finding(
             "latency timer",
             Verdict.WARN if slow else Verdict.OK,
             f"{latency_ms} ms" + (": samples come in bursts of that length" if slow else ""),
@@ -182,7 +184,7 @@ def usb(name: str, system: System) -> Iterator[Step]:
     flags = _read(system.sys / "class" / "tty" / name / "flags")
     if flags:
         quick = bool(int(flags, 16) & _LOW_LATENCY)
-        yield Step(
+        yield Finding(
             "low latency",
             Verdict.OK if quick else Verdict.WARN,
             "set" if quick else "not set: the system may hold bytes back",
@@ -193,7 +195,7 @@ def usb(name: str, system: System) -> Iterator[Step]:
         if (folder / "idVendor").exists():
             sleeps = _read(folder / "power" / "control") == "auto"
             control = folder / "power" / "control"
-            yield Step(
+            yield Finding(
                 "USB autosuspend",
                 Verdict.WARN if sleeps else Verdict.OK,
                 "on: the adapter may fall asleep" if sleeps else "off",

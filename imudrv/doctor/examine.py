@@ -11,7 +11,7 @@ import numpy as np
 
 from imudrv import diagnosis, profiles
 from imudrv.doctor.device import System, device_steps, interface_step, limits, usb
-from imudrv.doctor.verdict import Step, Verdict
+from imudrv.doctor.verdict import Finding, Verdict
 from imudrv.errors import InputError
 from imudrv.files import settings_file
 from imudrv.ports import Port, PortEndedError, PortLostError, open_port
@@ -76,7 +76,9 @@ def doctor(url: str, profile: str | None, say: Callable[[str], None]) -> bool:
     return healthy
 
 
-def examine(url: str, profile: str | None, listen_s: float, system: System | None = None) -> Iterator[Step]:
+def examine(
+    url: str, profile: str | None, listen_s: float, system: System | None = None
+) -> Iterator[Finding]:
     """Examine a port, step by step.
 
     Parameters
@@ -128,7 +130,7 @@ def _device(parts: Url) -> Path | None:
     return Path(parts.address) if parts.scheme == "serial" and os.name == "posix" else None
 
 
-def _before(parts: Url, device: Path | None, system: System) -> Iterator[Step]:
+def _before(parts: Url, device: Path | None, system: System) -> Iterator[Finding]:
     """What can be told before the port is open."""
     if device is not None:
         yield from device_steps(device, system)
@@ -136,51 +138,53 @@ def _before(parts: Url, device: Path | None, system: System) -> Iterator[Step]:
         yield interface_step(parts.address.removeprefix("socketcan/"), system)
 
 
-def _load(profile: Profile) -> Step:
+def _load(profile: Profile) -> Finding:
     load = diagnosis.line_load(profile)
     line = profile.line
     speed = f"{line.baudrate} baud" if isinstance(line, SerialLine) else f"{line.bitrate} bit/s"
     found = f"{profile.name} at {profile.sample_rate_hz:g} Hz takes {100 * load:.1f} % of {speed}"
     if load > 1.0:
-        return Step("line load", Verdict.FAIL, found, "set the unit and the port to a faster line")
+        return Finding("line load", Verdict.FAIL, found, "set the unit and the port to a faster line")
     if load > _HEAVY:
-        return Step("line load", Verdict.WARN, found, "a faster line would leave room")
-    return Step("line load", Verdict.OK, found)
+        return Finding("line load", Verdict.WARN, found, "a faster line would leave room")
+    return Finding("line load", Verdict.OK, found)
 
 
 def _on_the_port(
     parts: Url, profile: Profile, given: bool, listen_s: float, device: Path | None, system: System
-) -> Iterator[Step]:
+) -> Iterator[Finding]:
     try:
         port = open_port(parts.text, profile)
     except PortLostError as error:
-        yield Step("open", Verdict.FAIL, str(error), "mend that and try again")
+        yield Finding("open", Verdict.FAIL, str(error), "mend that and try again")
         return
     try:
-        yield Step("open", Verdict.OK, parts.text)
+        yield Finding("open", Verdict.OK, parts.text)
         if device is not None:
             yield from usb(device.resolve().name, system)
         data, span_s, trouble = _listen(port, listen_s)
     finally:
         port.close()
     if trouble:
-        yield Step("data", Verdict.FAIL, trouble, "look at plug, cable and adapter")
+        yield Finding("data", Verdict.FAIL, trouble, "look at plug, cable and adapter")
         return
     if not given and len(data):
-        profile = diagnosis.best(_shipped(parts, profile.line, device), data) or profile
-    heard = diagnosis.hear(profile, data) if len(data) else None
+        profile = diagnosis.best_profile(_shipped(parts, profile.line, device), data) or profile
+    heard = diagnosis.decode_traffic(profile, data) if len(data) else None
     if heard is not None and heard.fits:
         if not given:
-            yield Step("profile", Verdict.OK, f"this is {profile.name}: --profile {profile.name}")
+            yield Finding("profile", Verdict.OK, f"this is {profile.name}: --profile {profile.name}")
             yield _load(profile)
-        yield from judge(profile, heard, span_s, port.source is Source.HARDWARE)
+        yield from check_traffic(profile, heard, span_s, port.source is Source.HARDWARE)
         return
     # a bus lets only the profile's identifiers through, so that silence may mean others
     found = _looks_like(parts, profile, data, device) if heard or profile.transport == "can" else None
     if heard is not None or found is not None:
-        yield mismatch(profile, heard or diagnosis.hear(profile, data), found, given)
+        yield mismatch(profile, heard or diagnosis.decode_traffic(profile, data), found, given)
         return
-    yield Step("data", Verdict.FAIL, f"silence: nothing in {listen_s:g} s", _AFTER_SILENCE[profile.transport])
+    yield Finding(
+        "data", Verdict.FAIL, f"silence: nothing in {listen_s:g} s", _AFTER_SILENCE[profile.transport]
+    )
 
 
 def _listen(port: Port, seconds: float) -> tuple[bytes | Records, float, str]:
@@ -210,7 +214,9 @@ def _listen(port: Port, seconds: float) -> tuple[bytes | Records, float, str]:
     return np.concatenate([np.zeros(0, MESSAGE), *pieces]), span_s, trouble
 
 
-def judge(profile: Profile, heard: diagnosis.Heard, span_s: float, in_real_time: bool) -> Iterator[Step]:
+def check_traffic(
+    profile: Profile, heard: diagnosis.TrafficSummary, span_s: float, in_real_time: bool
+) -> Iterator[Finding]:
     """Whether data of the right profile is as it should be.
 
     Parameters
@@ -231,21 +237,21 @@ def judge(profile: Profile, heard: diagnosis.Heard, span_s: float, in_real_time:
     counts = heard.counts
     found = diagnosis.explain(profile, heard, span_s)
     if heard.is_clean:
-        yield Step("data", Verdict.OK, found)
+        yield Finding("data", Verdict.OK, found)
     else:
-        yield Step(
+        yield Finding(
             "data",
             Verdict.FAIL,
             f"{found}; {counts}",
             "look at cable, ground, termination and line settings; is the reader quick enough?",
         )
     if counts.restarts:
-        yield Step(
+        yield Finding(
             "counter", Verdict.WARN, f"it jumped back {counts.restarts} times", "does the unit's power hold?"
         )
     rate = diagnosis.rate(heard, span_s)
     if in_real_time and abs(rate / profile.sample_rate_hz - 1.0) > diagnosis.RATE_TOLERANCE:
-        yield Step(
+        yield Finding(
             "rate",
             Verdict.FAIL,
             f"expected {profile.sample_rate_hz:g} samples/s, the unit counts {rate:.0f}",
@@ -253,7 +259,7 @@ def judge(profile: Profile, heard: diagnosis.Heard, span_s: float, in_real_time:
         )
     means = {bit.name: bit.means for bit in profile.status_bits}
     faults = [name for name in heard.set_bits if means[name] == "fault"]
-    yield Step(
+    yield Finding(
         "status",
         Verdict.WARN if faults else Verdict.OK,
         ", ".join(heard.set_bits) or "no bit set",
@@ -264,10 +270,12 @@ def judge(profile: Profile, heard: diagnosis.Heard, span_s: float, in_real_time:
             f"{name.replace('_', ' ')} {t:.2f} degC" if t == t else f"{name.replace('_', ' ')} not heard"
             for name, t in heard.degc.items()
         )
-        yield Step("temperatures", Verdict.OK, ", ".join(degc))
+        yield Finding("temperatures", Verdict.OK, ", ".join(degc))
 
 
-def mismatch(profile: Profile, heard: diagnosis.Heard, found: Profile | None, given: bool) -> Step:
+def mismatch(
+    profile: Profile, heard: diagnosis.TrafficSummary, found: Profile | None, given: bool
+) -> Finding:
     """What to say of data that is not the profile's.
 
     Parameters
@@ -292,7 +300,7 @@ def mismatch(profile: Profile, heard: diagnosis.Heard, found: Profile | None, gi
         sync = profile.messages[0].sync
         what = f"{heard.amount} bytes, sync {sync} seen {heard.syncs} times, {why}"
     if found is None:
-        return Step(
+        return Finding(
             "data",
             Verdict.FAIL,
             f"{what}; no shipped profile fits at any usual rate",
@@ -305,12 +313,14 @@ def mismatch(profile: Profile, heard: diagnosis.Heard, found: Profile | None, gi
         usual = profiles.load(found.name).line
         if (isinstance(usual, SerialLine) and usual.baudrate != found.line.baudrate) or not fix:
             fix.append(f"?baudrate={found.line.baudrate} in the URL")
-    return Step("data", Verdict.FAIL, f"{what}: this looks like {found.name}{at}", "use " + " and ".join(fix))
+    return Finding(
+        "data", Verdict.FAIL, f"{what}: this looks like {found.name}{at}", "use " + " and ".join(fix)
+    )
 
 
 def _looks_like(parts: Url, profile: Profile, data: bytes | Records, device: Path | None) -> Profile | None:
     """The profile and line that fit: first in the data that is there, then by trying."""
-    if (found := diagnosis.best(_shipped(parts, profile.line, device), data)) is not None:
+    if (found := diagnosis.best_profile(_shipped(parts, profile.line, device), data)) is not None:
         return found
     for other, options in _attempts(parts, profile, device):
         text = f"{parts.scheme}://{parts.address}?{urlencode(options)}"
@@ -322,7 +332,7 @@ def _looks_like(parts: Url, profile: Profile, data: bytes | Records, device: Pat
             data, _, _ = _listen(port, TRY_S)
         finally:
             port.close()
-        if (found := diagnosis.best([other, *_shipped(parts, other.line, device)], data)) is not None:
+        if (found := diagnosis.best_profile([other, *_shipped(parts, other.line, device)], data)) is not None:
             return found
     return None
 

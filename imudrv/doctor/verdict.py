@@ -12,7 +12,7 @@ class Verdict(Enum):
     FAIL = "fail"
 
 
-class Step(NamedTuple):
+class Finding(NamedTuple):
     """One step of the examination.
 
     Parameters

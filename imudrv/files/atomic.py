@@ -166,7 +166,7 @@ def backup_name(path: Path) -> Path:
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[IO[bytes]]:
+def atomic_write(path: Path) -> Iterator[IO[bytes]]:
     """A file that takes its name only once it is whole.
 
     Parameters

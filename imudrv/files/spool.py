@@ -45,7 +45,7 @@ class Piece(NamedTuple):
 _NOTHING: Final = Piece(b"", 0, False)
 
 
-class Spool:
+class AppendThread:
     """Writer of one new file.
 
     A piece goes to the system at once and outlives this process; it goes in whole or, where the disk takes

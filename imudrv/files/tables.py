@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imudrv.errors import InputError
-from imudrv.files.atomic import replacing
+from imudrv.files.atomic import atomic_write
 from imudrv.files.outputs import is_standard_output
 from imudrv.records import INCREMENTS, Records, Source
 from imudrv.wire.datagram import encode
@@ -235,7 +235,7 @@ def table(path: Path, kinds: Sequence[str], parts: Mapping[str, Sequence[str]]) 
 
 @contextmanager
 def writing(path: Path) -> Iterator[IO[bytes]]:
-    """Standard output where the name means that, and a file as of `replacing` otherwise.
+    """Standard output where the name means that, and a file as of `atomic_write` otherwise.
 
     Parameters
     ----------
@@ -250,12 +250,12 @@ def writing(path: Path) -> Iterator[IO[bytes]]:
     Raises
     ------
     InputError
-        See `replacing`; or standard output is closed or full.
+        See `atomic_write`; or standard output is closed or full.
     BrokenPipeError
         The reader of standard output has left.
     """
     if not is_standard_output(path):
-        with replacing(path) as file:
+        with atomic_write(path) as file:
             yield file
         return
     try:

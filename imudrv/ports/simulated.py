@@ -11,7 +11,7 @@ from imudrv.ports.base import Port, PortEndedError, PortLostError
 from imudrv.ports.url import split
 from imudrv.profiles.schema import Profile
 from imudrv.records import MESSAGE, Arrival, Records, Source
-from imudrv.sim.live import AHEAD, MOST, Pace, Playback, speed_of
+from imudrv.sim.live import AHEAD, MOST, Pace, PacedPlayback, speed_of
 from imudrv.sim.scenario import Scenario, load
 
 _NOTHING: Final = np.zeros(0, MESSAGE)
@@ -65,7 +65,7 @@ class SimulatedPort(Port):
 
     def __init__(self, url: str, scenario: Scenario, profile: Profile, speed: float | None) -> None:
         super().__init__(url, Source.SIMULATOR)
-        self._playback: Playback | None = Playback(scenario, profile.layout())
+        self._playback: PacedPlayback | None = PacedPlayback(scenario, profile.layout())
         self._is_paced = speed is not None
         self._most = AHEAD if self._is_paced else MOST
         self._pace = Pace(speed)

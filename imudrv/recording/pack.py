@@ -6,7 +6,7 @@ from typing import NamedTuple
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import Writer
 
-from imudrv.files.atomic import replacing
+from imudrv.files.atomic import atomic_write
 from imudrv.recording.reader import Recording
 
 
@@ -48,7 +48,7 @@ def pack(source: Path, target: Path) -> Packed:
     schemas: dict[int, int] = {0: 0}
     channels: dict[int, int] = {}
     messages = 0
-    with replacing(target) as file:
+    with atomic_write(target) as file:
         writer = Writer(file)
         writer.start()
         for offset, record in recording._items():

@@ -6,7 +6,7 @@ from typing import Any, Final
 import numpy as np
 
 from imudrv.errors import InputError
-from imudrv.files.atomic import replacing
+from imudrv.files.atomic import atomic_write
 from imudrv.recording.format import ORIGIN
 from imudrv.recording.reader import Recording
 from imudrv.recording.tally import Exported, Tally
@@ -54,7 +54,7 @@ def export_ros2(recording: Recording, target: Path) -> Exported:
             "--to ros2: expected the package mcap-ros2-support: pip install imu50[ros2]"
         ) from error
     tally = Tally()
-    with replacing(target) as file:
+    with atomic_write(target) as file:
         writer = Writer(file)
         schema = writer.register_msgdef("sensor_msgs/msg/Imu", _IMU_DEFINITION)
         writer.add_metadata(ORIGIN, recording.origin)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imudrv.errors import InputError
-from imudrv.files.atomic import replacing
+from imudrv.files.atomic import atomic_write
 from imudrv.recording.reader import Recording
 from imudrv.recording.tally import Exported, Tally
 from imudrv.records import Records
@@ -71,7 +71,7 @@ def export_imr(recording: Recording, target: Path) -> Exported:
     header["szProgramName"] = f"imudrv {version('imu50')}".encode()[:31]
     gyro = _Rounding("angle", "deg", _GYRO_DEG)
     accelerometer = _Rounding("velocity", "m/s", _ACCELEROMETER_M_S)
-    with replacing(target) as file:
+    with atomic_write(target) as file:
         file.write(header.tobytes())
         for increments in tally.of(recording.increments()):
             samples = np.zeros(increments.size, _SAMPLE)

@@ -28,12 +28,12 @@ from imudrv.errors import InputError
 from imudrv.files import atomic
 from imudrv.hostclock import now_ns
 from imudrv.imu.rate_filter import rate_filter
-from imudrv.pipeline import Pipeline, Sampled
+from imudrv.pipeline import Pipeline, PipelineOutput
 from imudrv.ports import Port, PortEndedError, PortLostError, check_url, open_port
 from imudrv.profiles.schema import Profile
 from imudrv.records import INCREMENTS, PULSES, Flag, Source
 from imudrv.service.latency import Latency
-from imudrv.service.runtime import Manager, Signals, ask_realtime, quiet_memory
+from imudrv.service.runtime import SignalFlags, SystemdNotifier, ask_realtime, frozen_gc
 from imudrv.service.settings import Settings, default_status_path
 from imudrv.service.status import Status, health
 from imudrv.service.status_socket import StatusServer
@@ -96,7 +96,7 @@ class Service:
         warn: Callable[[str], None] | None = None,
         in_real_time: bool = True,
         history: History | None = None,
-        signals: Signals | None = None,
+        signals: SignalFlags | None = None,
         notices: Callable[[], list[str]] = list,
     ) -> None:
         self._settings = settings
@@ -114,11 +114,11 @@ class Service:
         self._rates = rate_filter(settings.rate_filter, self._layout.interval_ns)
         self._pipeline = Pipeline(self._profile, coefficients(self._calibration.model), self._rates)
         self._latency = Latency(self._layout.interval_ns)
-        self._signals = signals or Signals()
+        self._signals = signals or SignalFlags()
         self._history = history
         self._switches: deque[tuple[Path | None, int | None, Future[None]]] = deque()
         self._has_ended = False
-        self._manager = Manager()
+        self._manager = SystemdNotifier()
         self._notices: list[str] = []
         self._events: list[str] = []
         self._port: Port | None = None
@@ -156,7 +156,7 @@ class Service:
             self._notices.append(refusal)
             self._failure(refusal)
         warm_up(self._profile, self._calibration.model, self._settings)
-        with self._signals.caught(SIGTERM, SIGINT, SIGHUP), quiet_memory():
+        with self._signals.caught(SIGTERM, SIGINT, SIGHUP), frozen_gc():
             try:
                 self._refresh(now_ns())
                 self._manager.tell("READY=1")
@@ -235,7 +235,7 @@ class Service:
                 next_poll_ns = now + POLL_NS
                 self._poll(now)
 
-    def _publish(self, sampled: Sampled, arrival_ns: int) -> None:
+    def _publish(self, sampled: PipelineOutput, arrival_ns: int) -> None:
         pulses, increments = sampled
         if len(pulses):
             self._samples += len(pulses)

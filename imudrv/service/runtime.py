@@ -18,7 +18,7 @@ _MCL_CURRENT_AND_FUTURE: Final = 3
 
 
 @contextmanager
-def quiet_memory() -> Iterator[None]:
+def frozen_gc() -> Iterator[None]:
     """Keep the garbage collector from stopping the loop: what stands now is kept, nothing is searched."""
     gc.collect()
     gc.freeze()
@@ -52,7 +52,7 @@ def ask_realtime() -> str | None:
     return None
 
 
-class Signals:
+class SignalFlags:
     """SIGTERM and SIGINT end the loop, SIGHUP makes it read the calibration again; seen at its next turn.
 
     A SIGHUP because the terminal has gone ends it too: nobody is there any more.
@@ -89,7 +89,7 @@ class Signals:
                 signal.signal(number, handler)
 
 
-class Manager:
+class SystemdNotifier:
     """The service manager, where one started us (systemd's notify protocol, sd_notify(3))."""
 
     def __init__(self) -> None:

@@ -15,7 +15,7 @@ from imudrv.wire.encode import CanEncoder, StreamEncoder
 from imudrv.wire.layout import Layout
 
 
-class Piece(NamedTuple):
+class WireChunk(NamedTuple):
     """What the wire carries for a stretch of samples.
 
     Parameters
@@ -36,7 +36,7 @@ class Piece(NamedTuple):
     truth: Records
 
 
-def wire(scenario: Scenario, layout: Layout, chunk: int = 65_536) -> Iterator[Piece]:
+def wire(scenario: Scenario, layout: Layout, chunk: int = 65_536) -> Iterator[WireChunk]:
     """Simulate a scenario onto the wire of a profile, with the scenario's faults.
 
     Parameters
@@ -65,7 +65,7 @@ def wire(scenario: Scenario, layout: Layout, chunk: int = 65_536) -> Iterator[Pi
     for part in chunks:
         t_ns = part.pulses["arrival_ns"]
         data, damage = line.apply(frames.encode(part.pulses), t_ns)
-        yield Piece(data, t_ns, np.cumsum(damage.size), part.truth)
+        yield WireChunk(data, t_ns, np.cumsum(damage.size), part.truth)
 
 
 def record(scenario: Scenario, layout: Layout) -> Iterator[tuple[bytes, Records]]:
@@ -88,8 +88,8 @@ def record(scenario: Scenario, layout: Layout) -> Iterator[tuple[bytes, Records]
         yield data if isinstance(data, bytes) else format_candump(data), piece.truth
 
 
-def _messages(messages: Records, truth: Records) -> Piece:
-    return Piece(messages, messages["t_ns"], np.arange(1, messages.size + 1), truth)
+def _messages(messages: Records, truth: Records) -> WireChunk:
+    return WireChunk(messages, messages["t_ns"], np.arange(1, messages.size + 1), truth)
 
 
 def _within(scenario: Scenario, layout: Layout) -> Scenario:

@@ -37,7 +37,7 @@ _RETRY_S: Final = 0.002
 _AT_ONCE: Final = 4096
 
 
-class Link(ABC):
+class SimulatedLine(ABC):
     """A line.
 
     Parameters
@@ -82,7 +82,7 @@ class Link(ABC):
         """Give the line back."""
 
 
-class _FileLink(Link):
+class _FileLink(SimulatedLine):
     """A line behind a file descriptor, -1 while it is unplugged."""
 
     _fd = -1
@@ -123,7 +123,7 @@ class PtyLink(_FileLink):
     Parameters
     ----------
     waits, say, stop
-        As for `Link`.
+        As for `SimulatedLine`.
     name : str
         What plays, for people.
     link : str or None
@@ -213,7 +213,7 @@ class SerialLink(_FileLink):
     Parameters
     ----------
     waits, say, stop
-        As for `Link`.
+        As for `SimulatedLine`.
     name : str
         What plays, for people.
     path : str
@@ -274,13 +274,13 @@ class SerialLink(_FileLink):
         self._fd = -1
 
 
-class TcpLink(Link):
+class TcpLink(SimulatedLine):
     """A TCP server; every client gets every byte from when it came.
 
     Parameters
     ----------
     waits, say, stop
-        As for `Link`.
+        As for `SimulatedLine`.
     name : str
         What plays, for people.
     host, port
@@ -390,13 +390,13 @@ class TcpLink(Link):
         self._clients = []
 
 
-class CanLink(Link):
+class CanLink(SimulatedLine):
     """A CAN bus, of any interface of python-can; unplugged it is silent.
 
     Parameters
     ----------
     waits, say, stop
-        As for `Link`.
+        As for `SimulatedLine`.
     name : str
         What plays, for people.
     url : str
@@ -473,7 +473,7 @@ def open_link(
     say: Callable[[str], None],
     link: str | None,
     stop: threading.Event,
-) -> Link:
+) -> SimulatedLine:
     """Open the line that a target names.
 
     Parameters
@@ -483,7 +483,7 @@ def open_link(
     profile : Profile
         What plays on it, and the settings of the line.
     waits, say, stop
-        As for `Link`.
+        As for `SimulatedLine`.
     link : str or None
         As for `PtyLink`.
 

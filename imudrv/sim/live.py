@@ -19,7 +19,7 @@ import numpy as np
 from imudrv.errors import InputError
 from imudrv.profiles.schema import Profile
 from imudrv.records import Records
-from imudrv.sim.capture import Piece, wire
+from imudrv.sim.capture import WireChunk, wire
 from imudrv.sim.links import open_link
 from imudrv.sim.scenario import Scenario, samples
 from imudrv.units import NS
@@ -50,7 +50,7 @@ class Due(NamedTuple):
     last_ns: int
 
 
-class Playback:
+class PacedPlayback:
     """What a simulated unit sends, in the order of time; made ahead in another thread, the first of it now.
 
     Parameters
@@ -63,7 +63,7 @@ class Playback:
 
     def __init__(self, scenario: Scenario, layout: Layout) -> None:
         self._pieces = _ahead(wire(scenario, layout, AHEAD))
-        self._piece: Piece | None = None
+        self._piece: WireChunk | None = None
         self._row = 0
         self.due_ns()
 
@@ -224,7 +224,7 @@ def play(
     latest_ns = last_ns = 0
     with (
         _signals_set(stop),
-        closing(Playback(scenario, layout)) as unit,
+        closing(PacedPlayback(scenario, layout)) as unit,
         # the first samples are there before anybody hears of the line
         closing(open_link(target, profile, speed is None, say, link, stop)) as line,
     ):
@@ -289,7 +289,7 @@ def speed_of(text: str) -> float | None:
     return speed
 
 
-def _ahead(pieces: Iterator[Piece]) -> Generator[Piece, None, None]:
+def _ahead(pieces: Iterator[WireChunk]) -> Generator[WireChunk, None, None]:
     """Make the next piece while this one is used."""
     with ThreadPoolExecutor(1) as worker:
         coming = worker.submit(next, pieces, None)

@@ -109,7 +109,7 @@ class _Electronics(NamedTuple):
     time_constant_s: float
 
 
-def draw(scenario: Scenario) -> TrueUnit:
+def draw_true_unit(scenario: Scenario) -> TrueUnit:
     """Draw the true unit: the scenario's calibration and residuals, by the scenario's seed.
 
     Parameters
@@ -173,7 +173,7 @@ def simulate(scenario: Scenario, interval_ns: int, chunk: int = 65_536) -> Itera
     if chunk < 1:
         raise InputError(f"simulation: expected chunks of one sample at least, got {chunk}")
     interval_s = interval_ns * NS
-    truth = draw(scenario)
+    truth = draw_true_unit(scenario)
     rng = _generator(scenario, 3)
     # Skewed, an accelerometer's sample is the late part of one interval and the early part of a later one.
     skew, split_ns = divmod(round(scenario.unit.accelerometer_skew_s / NS), interval_ns)
@@ -336,14 +336,14 @@ def _count(
         for m in range(3):
             angle = dot(row(unit.G, m), angle_b) + left[m] - before[m] + unit.gyro_noise * noise[i, m]
             scale = unit.gyro_scale[m] * (1.0 + warmer * unit.gyro_scale_per_k[m])
-            pulses = _whole(angle / scale, carry, m)
+            pulses = _quantise(angle / scale, carry, m)
             counts[i, m] = min(max(pulses, -unit.gyro_limit), unit.gyro_limit)
             overflow[i] |= abs(pulses) > unit.gyro_limit
         for m in range(3):
             bias = unit.accelerometer_bias[m] + warmer * unit.accelerometer_bias_per_k[m]
             speed = velocity[i, m] + tau * bias + unit.accelerometer_noise * noise[i, 3 + m]
             scale = unit.accelerometer_scale[m] * (1.0 + warmer * unit.accelerometer_scale_per_k[m])
-            pulses = _whole(speed * scale, carry, 3 + m)
+            pulses = _quantise(speed * scale, carry, 3 + m)
             counts[i, 3 + m] = min(max(pulses, -unit.accelerometer_limit), unit.accelerometer_limit)
             overflow[i] |= abs(pulses) > unit.accelerometer_limit
         before = left
@@ -361,7 +361,7 @@ def _left(dither: Dithering, interval: int) -> Vector:
 
 
 @kernel
-def _whole(pulses: float, carry: Array, axis: int) -> float:
+def _quantise(pulses: float, carry: Array, axis: int) -> float:
     total = carry[axis] + pulses
     whole: float = np.rint(total)
     carry[axis] = total - whole

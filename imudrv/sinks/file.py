@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from imudrv.errors import InputError
-from imudrv.files.spool import Piece, Spool
+from imudrv.files.spool import AppendThread, Piece
 from imudrv.files.tables import CsvTable, increment_columns
 from imudrv.records import Records
 from imudrv.sinks.base import Batch, Sink, SinkState
@@ -45,7 +45,7 @@ class FileSink(Sink):
         self._put = self._dropped = 0
         self._text = BytesIO()
         self._table = CsvTable(self._text, {}) if path.suffix == ".csv" else None
-        self._spool = Spool(path, b"", self._next_piece)
+        self._spool = AppendThread(path, b"", self._next_piece)
 
     def publish(self, batch: Batch) -> None:
         """Hand a batch on."""

@@ -19,7 +19,7 @@ from mcap.opcode import Opcode
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import Writer
 
-from imudrv.files.spool import Piece, Spool
+from imudrv.files.spool import AppendThread, Piece
 from imudrv.hostclock import now_ns
 from imudrv.recording import format
 from imudrv.recording.format import pack_messages
@@ -95,7 +95,7 @@ class Recorder:
         # The library writes to anything with write and tell.
         self._writer = Writer(self._staging, use_chunking=False, use_statistics=False)
         self._begin(profile, calibration, source, port, unit)
-        self._spool = Spool(path, self._staging.take(), self._next_piece, self._last_piece)
+        self._spool = AppendThread(path, self._staging.take(), self._next_piece, self._last_piece)
 
     def arrived(self, arrival: Arrival) -> None:
         """Take in what the port brought; to be called before it is used.

@@ -17,14 +17,14 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from calib.bench import run
 from calib.bench.evidence import Attempt, identify
 from calib.bench.journal import Journal, begin
+from calib.bench.run import run
 from calib.bench.session import JOURNAL, Session
 from calib.bench.simulated_unit import SEED
-from calib.bench.technician import BENCH, technician
+from calib.bench.technician import BENCH, technician_scenario
 from calib.bench.verify import verify
-from calib.identification import Basis
+from calib.identification import PriorCalibration
 from calib.procedure.plan import load, predicted
 from imudrv.calibration import SizeEffect, read_calibration, write_calibration
 from imudrv.errors import InputError
@@ -53,7 +53,7 @@ RUN = """
 import sys
 from pathlib import Path
 from rich.console import Console
-from calib.bench import run
+from calib.bench.run import run
 from imudrv.terminal import guarded
 procedure, folder, *redo = sys.argv[1:]
 sys.exit(guarded(lambda: run(
@@ -313,7 +313,7 @@ def test_only_a_session_that_is_there_can_be_done_again_in_part(tmp_path: Path) 
     with pytest.raises(
         InputError, match="--redo: expected a session that is there, with --session, got none"
     ):
-        run.run(folder=tmp_path / "new", rehearse=True, redo=["z-up"], console=Console())
+        run(folder=tmp_path / "new", rehearse=True, redo=["z-up"], console=Console())
 
 
 def test_a_counter_that_went_round_before_the_recording_makes_no_difference(
@@ -335,7 +335,7 @@ def test_a_counter_that_went_round_before_the_recording_makes_no_difference(
                 )
                 for step in procedure.steps
             ],
-            Basis(before, "unit.yaml", ""),
+            PriorCalibration(before, "unit.yaml", ""),
             BENCH,
         ).certificate
         for rounds in (0, 3)
@@ -374,7 +374,7 @@ def sigma(found: SizeEffect) -> np.ndarray:
 
 def check_true(folder: Path) -> None:
     """The result is as near to the truth as it says, and as near as is asked for."""
-    unit = technician(load(str(folder.parent / "short.yaml")), seed=SEED).unit.calibration
+    unit = technician_scenario(load(str(folder.parent / "short.yaml")), seed=SEED).unit.calibration
     assert unit is not None
     assert unit.size_effect is not None
     found = size_effect(folder)
@@ -401,22 +401,22 @@ def check_resumed(folder: Path) -> None:
 def test_a_session_that_is_over_is_not_begun_again(undisturbed: tuple[Path, str]) -> None:
     folder, _ = undisturbed
     with pytest.raises(InputError, match=r"the session is over, see report.html in it"):
-        run.run(folder=folder, rehearse=True, console=Console())
+        run(folder=folder, rehearse=True, console=Console())
 
 
 def test_keys_need_a_terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with open(os.devnull) as nothing:
         monkeypatch.setattr(sys, "stdin", nothing)
         with pytest.raises(InputError, match="expected a terminal for the operator's keys"):
-            run.run(folder=tmp_path / "new", console=Console())
+            run(folder=tmp_path / "new", console=Console())
 
 
 def test_a_rehearsal_has_its_own_unit_and_a_unit_no_rehearsal(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--rehearse: expected no --port"):
-        run.run(folder=tmp_path / "new", rehearse=True, port="/dev/ttyUSB0", console=Console())
+        run(folder=tmp_path / "new", rehearse=True, port="/dev/ttyUSB0", console=Console())
     (tmp_path / JOURNAL).touch()
     with pytest.raises(InputError, match="expected a rehearsal to go on with"):
-        run.run(folder=tmp_path, rehearse=True, console=Console())
+        run(folder=tmp_path, rehearse=True, console=Console())
 
 
 def test_a_recording_that_changes_while_it_is_read_gives_nothing(
@@ -456,10 +456,10 @@ def test_the_plan_holds_the_site_and_the_procedure_that_were_judged(
     def create(folder: Path, **about: Any) -> None:
         raise CreatedError(about["procedure"].text, about["site"].text)
 
-    monkeypatch.setattr(run, "predicted", judge)
+    monkeypatch.setattr("calib.bench.run.predicted", judge)
     monkeypatch.setattr(Session, "create", create)
     with pytest.raises(CreatedError) as created:
-        run.run(
+        run(
             port="/dev/ttyUSB0",
             profile="imu50-rs422",
             calibration=unit,
@@ -474,4 +474,4 @@ def test_the_plan_holds_the_site_and_the_procedure_that_were_judged(
 
 def test_a_new_session_wants_the_units_papers(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="expected --port, --profile, --calibration and --site"):
-        run.run(folder=tmp_path / "new", hands_free=True, console=Console())
+        run(folder=tmp_path / "new", hands_free=True, console=Console())

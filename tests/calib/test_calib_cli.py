@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from calib.cli.main import main
-from calib.identification import Basis, find
+from calib.identification import PriorCalibration, identify_captures
 from imudrv.calibration import read_calibration_file, write_calibration
 from imudrv.cli import main as imudrv
 from imudrv.errors import InputError
@@ -200,10 +200,10 @@ def test_a_capture_that_grows_while_it_is_read_gives_nothing(here: Path) -> None
                 capture.write(b"more")
 
     unit = read_calibration_file(here / "unit.yaml")
-    basis = Basis(unit.model, "unit.yaml", unit.sha256)
+    basis = PriorCalibration(unit.model, "unit.yaml", unit.sha256)
     site = settings_file.read(here / "site.yaml", Site)
     with pytest.raises(InputError, match=r"growing.raw: .* it was changed while it was read"):
-        find([growing], load_profile("imu50-rs422"), basis, site, advance=grow)
+        identify_captures([growing], load_profile("imu50-rs422"), basis, site, advance=grow)
 
 
 # Long, so that reading it takes a while.

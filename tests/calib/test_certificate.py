@@ -8,12 +8,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.certificate import CHANGED, FOUND, arms_of, certificate, check_target, with_arms, write
-from calib.detection.acceptance import Limits
+from calib.certificate import (
+    PROVENANCE_CONVERTED,
+    PROVENANCE_IDENTIFIED,
+    certificate,
+    check_target,
+    lever_arms_of,
+    with_lever_arms,
+    write,
+)
+from calib.detection.acceptance import RotationLimits
 from calib.detection.noise import Noise
-from calib.estimation.result import SHIFT_FREE, Identification, Nuisance, RunResult
+from calib.estimation.result import CENTROID_BASIS, LeverArmEstimate, ParameterEstimate, RunResult
 from calib.estimation.runs import Priors
-from calib.identification import Basis, Findings
+from calib.identification import IdentificationResult, PriorCalibration
 from calib.lever_arms.gauge import convert
 from calib.result_file import result_document, write_json
 from imudrv.calibration import Calibration, read_calibration, write_calibration
@@ -23,11 +31,11 @@ from imudrv.site import Site
 from imudrv.units import MM
 
 R = np.array([[23.5, -11.25, -9.0], [-22.75, 29.0, -7.0], [-0.75, -17.75, 16.0]]) * MM
-SPREAD = SHIFT_FREE * [1e-5, 1.1e-5, 1.2e-5, 1.8e-5, 1.9e-5, 2e-5]
+SPREAD = CENTROID_BASIS * [1e-5, 1.1e-5, 1.2e-5, 1.8e-5, 1.9e-5, 2e-5]
 WHEN = datetime(2026, 11, 25, 12, 0, tzinfo=UTC)
 
 
-def findings(**changes: object) -> Findings:
+def findings(**changes: object) -> IdentificationResult:
     told = RunResult(
         label="z#1",
         axis="+Z",
@@ -40,7 +48,7 @@ def findings(**changes: object) -> Findings:
         v_n=np.full((4, 2), 1e-3),
         fitted_n=np.full((4, 2), 0.5e-3),
     )
-    result = Identification(
+    result = LeverArmEstimate(
         method="joint",
         gauge="centroid",
         R_b=R,
@@ -52,17 +60,17 @@ def findings(**changes: object) -> Findings:
         chi_square=90.0,
         degrees_of_freedom=100,
         noise=Noise(1e-6, 1e-5, 1e-6, 1e-6),
-        nuisances=(Nuisance("accelerometer_bias_x", 1e-4, 2e-4, 5e-4),),
+        parameters=(ParameterEstimate("accelerometer_bias_x", 1e-4, 2e-4, 5e-4),),
         correlation=np.full((9, 1), 0.1),
-        left_out=(),
+        leave_one_out=(),
         runs=(told,),
         notes=(),
     )
-    return Findings(
+    return IdentificationResult(
         result=replace(result, **changes),  # type: ignore[arg-type]
-        basis=Basis(unit(), "unit.yaml", "ab" * 32),
+        basis=PriorCalibration(unit(), "unit.yaml", "ab" * 32),
         site=Site(latitude_deg=28.2, longitude_deg=113.0, height_m=60.0),
-        limits=Limits(),
+        limits=RotationLimits(),
         priors=Priors(),
         sources=(),
         created=WHEN,
@@ -71,7 +79,11 @@ def findings(**changes: object) -> Findings:
 
 
 def unit(serial_number: str = "50-0017") -> Calibration:
-    provenance = {"static": "turntable, 2026-11-01", FOUND: "an earlier one", CHANGED: "an earlier one"}
+    provenance = {
+        "static": "turntable, 2026-11-01",
+        PROVENANCE_IDENTIFIED: "an earlier one",
+        PROVENANCE_CONVERTED: "an earlier one",
+    }
     return NOMINAL.model_copy(update={"serial_number": serial_number, "provenance": provenance})
 
 
@@ -83,7 +95,7 @@ def test_a_certificate_comes_back_from_its_file_with_arms_covariance_and_gauge(t
     assert read.created == WHEN
     assert read.size_effect is not None
     assert read.size_effect.gauge == "centroid"
-    back = arms_of(read, "new.yaml")
+    back = lever_arms_of(read, "new.yaml")
     # the file has nanometres, and 1e-9 mm^2
     np.testing.assert_allclose(back.r_b, R, rtol=0, atol=0.51e-9)
     assert back.covariance is not None
@@ -98,8 +110,8 @@ def test_the_certificate_keeps_the_static_calibration_and_says_how_the_arms_were
     assert new.accelerometer == found.basis.calibration.accelerometer
     assert new.provenance is not None
     assert new.provenance["static"] == "turntable, 2026-11-01"
-    assert CHANGED not in new.provenance  # of arms that are no more
-    how = new.provenance[FOUND]
+    assert PROVENANCE_CONVERTED not in new.provenance  # of arms that are no more
+    how = new.provenance[PROVENANCE_IDENTIFIED]
     assert isinstance(how, dict)
     assert how["calibration"] == {"name": "unit.yaml", "sha256": "ab" * 32}
     assert how["rank"] == 6
@@ -128,7 +140,7 @@ def test_nothing_is_certified_on_increments_that_carry_dither() -> None:
 
 def test_as_many_equations_as_unknowns_contradict_nothing() -> None:
     found = findings(
-        chi_square=0.0, degrees_of_freedom=0, method="plain", nuisances=(), correlation=np.zeros((9, 0))
+        chi_square=0.0, degrees_of_freedom=0, method="plain", parameters=(), correlation=np.zeros((9, 0))
     )
     assert certificate(found, found.arms).size_effect is not None
 
@@ -167,19 +179,21 @@ def test_a_gauge_converted_to_and_fro_through_calibrations_is_the_same_to_a_nano
     found = findings()
     first = certificate(found, found.arms)
     for gauge in ("x", "z", "centroid"):
-        first = with_arms(first, convert(arms_of(first, "it"), gauge), CHANGED, {"to": gauge})  # type: ignore[arg-type]
-    back = arms_of(first, "it")
+        first = with_lever_arms(
+            first, convert(lever_arms_of(first, "it"), gauge), PROVENANCE_CONVERTED, {"to": gauge}
+        )  # type: ignore[arg-type]
+    back = lever_arms_of(first, "it")
     np.testing.assert_allclose(back.r_b, R, rtol=0, atol=3e-9)  # rounded to nm three times
     assert back.covariance is not None
     np.testing.assert_allclose(back.covariance, SPREAD @ SPREAD.T, rtol=0, atol=1e-14)
     assert first.provenance is not None
-    assert FOUND in first.provenance
+    assert PROVENANCE_IDENTIFIED in first.provenance
 
 
 def test_a_calibration_without_arms_has_none_to_convert() -> None:
     bare = NOMINAL.model_copy(update={"size_effect": None})
     with pytest.raises(InputError, match=r"bare.yaml: expected a calibration with size_effect"):
-        arms_of(bare, "bare.yaml")
+        lever_arms_of(bare, "bare.yaml")
 
 
 def test_the_json_document_has_the_whole_result_with_units_in_its_names(tmp_path: Path) -> None:

@@ -14,13 +14,13 @@ import pytest
 from rich.console import Console
 
 from calib.bench import controller as conducts
-from calib.bench.controller import Conduct
+from calib.bench.controller import SessionController
 from calib.bench.evidence import Result
-from calib.bench.keys import Keys
-from calib.bench.queue_sink import Tap
-from calib.bench.screen import Screen, plain
-from calib.bench.session import Document, Session
-from calib.bench.technician import BENCH, Mistake, technician
+from calib.bench.keys import Keyboard
+from calib.bench.queue_sink import QueueSink
+from calib.bench.screen import OperatorScreen, plain
+from calib.bench.session import EmbeddedFile, Session
+from calib.bench.technician import BENCH, Mistake, technician_scenario
 from calib.bench.verify import verify
 from calib.procedure.events import View
 from calib.procedure.plan import steps_left
@@ -100,7 +100,7 @@ class Line:
         self.stopped = True
 
 
-class Typed(Keys):
+class Typed(Keyboard):
     """Keys that are pressed once the screen asks for something."""
 
     def __init__(self, press: Callable[[str], str] = lambda _: "") -> None:
@@ -112,7 +112,7 @@ class Typed(Keys):
         return self.press(self.seen)
 
 
-class Shown(Screen):
+class Shown(OperatorScreen):
     """A screen that the fingers see at once."""
 
     def __init__(self, keys: Typed) -> None:
@@ -145,7 +145,7 @@ def performed(scenario: Scenario) -> list[Batch]:
 
 @pytest.fixture(scope="module")
 def batches() -> list[Batch]:
-    return performed(technician(PROCEDURE, calibration=NOMINAL))
+    return performed(technician_scenario(PROCEDURE, calibration=NOMINAL))
 
 
 @pytest.fixture
@@ -154,9 +154,9 @@ def session(tmp_path: Path) -> Iterator[Session]:
     settings_file.write(tmp_path / "site.yaml", BENCH)
     session = Session.create(
         tmp_path / "session",
-        procedure=Document("one.yaml", ONE),
+        procedure=EmbeddedFile("one.yaml", ONE),
         calibration=tmp_path / "unit.yaml",
-        site=Document("site.yaml", (tmp_path / "site.yaml").read_text()),
+        site=EmbeddedFile("site.yaml", (tmp_path / "site.yaml").read_text()),
         profile="imu50-rs422",
         port="nowhere",
     )
@@ -174,13 +174,13 @@ def conducted(
     history_bytes: int = MAX_BYTES,
     dropped: range = range(0),
     port_states: Sequence[LineState] = (),
-) -> tuple[Conduct, str]:
+) -> tuple[SessionController, str]:
     """Work through items, behind which nothing comes; `stopped`: the service ended before they were taken.
 
     All of them have passed before the worker begins: it is as late as it can be. `dropped`: samples that the
     first recording lacks.
     """
-    tap, line, keys = Tap(None), Line(History(history_bytes)), keys or Typed()
+    tap, line, keys = QueueSink(None), Line(History(history_bytes)), keys or Typed()
     line.dropped = dropped
     line.states += port_states
     for item in items:
@@ -192,7 +192,7 @@ def conducted(
     tap.close()
     tap.is_closed = stopped
     screen = Shown(keys)
-    conduct = Conduct(
+    conduct = SessionController(
         session,
         PROCEDURE,
         LAYOUT,
@@ -271,7 +271,7 @@ def test_what_the_service_says_of_the_port_is_shown_and_journaled(
 
 
 def test_a_mistake_is_journaled_with_its_reasons_and_its_evidence_kept(session: Session) -> None:
-    scenario = technician(PROCEDURE, [Mistake("z-up", "short")], calibration=NOMINAL)
+    scenario = technician_scenario(PROCEDURE, [Mistake("z-up", "short")], calibration=NOMINAL)
     _, text = conducted(session, performed(scenario))
     (rejected,) = (entry for entry in session.entries if entry["event"] == "rejected")
     assert "turned 150" in rejected["reasons"][0]
@@ -321,7 +321,7 @@ def test_a_step_whose_recording_has_a_hole_is_done_again_and_then_counts(session
     pose = ONE[ONE.index("{id") : ONE.index("]")]
     twice = ONE.replace(pose, f"{pose}, {pose.replace('z-up', 'again')}")
     procedure = settings_file.parse_text(twice.encode(), Procedure, "twice.yaml")
-    batches = performed(technician(procedure, calibration=NOMINAL))
+    batches = performed(technician_scenario(procedure, calibration=NOMINAL))
     aligning = int(batches[250].pulses["counter"][0])
     conducted(session, list(batches), dropped=range(aligning, aligning + 200))
     (rejected,) = (entry for entry in session.entries if entry["event"] == "rejected")
@@ -342,18 +342,18 @@ def test_a_key_refers_to_the_view_that_the_operator_sees(
 def test_evidence_is_whole_though_the_worker_is_held_up_for_as_long_as_a_step_takes(
     session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    done = technician(PROCEDURE, calibration=NOMINAL)
+    done = technician_scenario(PROCEDURE, calibration=NOMINAL)
     stays = Segment(rest=Rest(duration_s=1000.0))
     settings_file.write(
         tmp_path / "technician.yaml", done.model_copy(update={"motion": (*done.motion, stays)})
     )
     settings = Settings(
-        port=f"sim://{tmp_path / 'technician.yaml'}?speed=20",
+        port=f"sim://{tmp_path / 'technician_scenario.yaml'}?speed=20",
         profile="imu50-rs422",
         calibration=str(session.folder / "working.yaml"),
         status=str(tmp_path / "socket"),
     )
-    append, tap, keys = session.append, Tap(None), Typed()
+    append, tap, keys = session.append, QueueSink(None), Typed()
 
     def held_up(entry: dict[str, Any]) -> None:
         append(entry)
@@ -362,7 +362,7 @@ def test_evidence_is_whole_though_the_worker_is_held_up_for_as_long_as_a_step_ta
 
     monkeypatch.setattr(session, "append", held_up)
     service = Service(settings, lambda _: None, [tap], history=History())
-    conduct = Conduct(
+    conduct = SessionController(
         session, PROCEDURE, LAYOUT, service, tap, Shown(keys), keys, hands_free=True, begin=lambda _: None
     )
     worker = Thread(target=conduct.run)
@@ -422,7 +422,7 @@ def test_a_result_that_is_turned_down_changes_nothing(
     session: Session, batches: list[Batch], found: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = session.plan.certificate.read_bytes()
-    monkeypatch.setattr(Conduct, "_decided", lambda *_: False)
+    monkeypatch.setattr(SessionController, "_decided", lambda *_: False)
     conduct, _ = conducted(session, list(batches), stopped=False)
     assert "turned down" in conduct.outcome
     assert session.is_over
@@ -442,7 +442,7 @@ def test_nothing_is_decided_behind_a_ctrl_c(session: Session, batches: list[Batc
 def test_a_certificate_that_somebody_changed_meanwhile_is_not_overwritten(
     session: Session, batches: list[Batch], found: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Conduct, "_decided", lambda *_: True)
+    monkeypatch.setattr(SessionController, "_decided", lambda *_: True)
     active = session.plan.certificate
     active.write_text(active.read_text() + "# by hand\n")
     conduct, _ = conducted(session, list(batches), stopped=False)

@@ -14,8 +14,8 @@ import pytest
 from rich.console import Console
 
 from calib.bench import block_letters
-from calib.bench.keys import Keys
-from calib.bench.screen import UNHEARD, UNREADABLE, Screen, plain, screen, with_port_state
+from calib.bench.keys import Keyboard
+from calib.bench.screen import UNHEARD, UNREADABLE, OperatorScreen, plain, screen, with_port_state
 from calib.procedure.events import Abort, Confirm, Phase, Redo, Skip, View
 from imudrv.diagnosis import LineState
 
@@ -169,7 +169,7 @@ def test_a_terminal_without_blocks_gets_ascii() -> None:
 
 def test_without_a_terminal_each_change_is_a_line() -> None:
     out = StringIO()
-    shown = Screen(Console(file=out, width=80))
+    shown = OperatorScreen(Console(file=out, width=80))
     shown.show(view(rate_deg_per_s=20.0, hints=("roll it over",)))
     shown.show(view(rate_deg_per_s=30.0, hints=("roll it over",), bells=1))
     shown.show(view(Phase.VERDICT, "REJECTED: DO IT AGAIN", reasons=("turned 150.0 deg, want 180 +- 5",)))
@@ -185,7 +185,7 @@ def test_without_a_terminal_each_change_is_a_line() -> None:
 def test_a_dumb_terminal_gets_lines_too(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TERM", "dumb")
     out = StringIO()
-    shown = Screen(Console(file=out, force_terminal=True, width=80))
+    shown = OperatorScreen(Console(file=out, force_terminal=True, width=80))
     shown.show(view())
     shown.close()
     assert out.getvalue() == plain(view()) + "\n"
@@ -194,7 +194,7 @@ def test_a_dumb_terminal_gets_lines_too(monkeypatch: pytest.MonkeyPatch) -> None
 def test_the_bell_rings_when_bells_grow(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TERM", "xterm-256color")
     out = StringIO()
-    shown = Screen(Console(file=out, force_terminal=True, width=80, height=24))
+    shown = OperatorScreen(Console(file=out, force_terminal=True, width=80, height=24))
     for bells in (0, 1, 1, 2):
         shown.show(view(bells=bells))
         written(shown)
@@ -202,7 +202,7 @@ def test_the_bell_rings_when_bells_grow(monkeypatch: pytest.MonkeyPatch) -> None
     assert out.getvalue().count("\a") == 2
 
 
-def written(shown: Screen) -> None:
+def written(shown: OperatorScreen) -> None:
     """Wait until a screen has written everything."""
     end = time.monotonic() + DEADLINE_S
     while not shown.is_idle:
@@ -229,7 +229,7 @@ def test_nobody_waits_for_a_stopped_terminal_and_then_only_the_newest_view_is_dr
 ) -> None:
     monkeypatch.setenv("TERM", "xterm-256color")
     out = Stopped()
-    shown = Screen(Console(file=out, force_terminal=True, width=80, height=24))
+    shown = OperatorScreen(Console(file=out, force_terminal=True, width=80, height=24))
     shown.show(view(title="first"))
     assert out.waits.wait(DEADLINE_S)
     for k in range(1000):
@@ -247,7 +247,7 @@ def test_nobody_waits_for_a_stopped_terminal_and_then_only_the_newest_view_is_dr
 
 def test_what_is_printed_and_plain_lines_wait_in_order_for_a_stopped_reader() -> None:
     out = Stopped()
-    shown = Screen(Console(file=out, width=80))
+    shown = OperatorScreen(Console(file=out, width=80))
     for k in range(3):
         shown.show(view(title=f"view {k}"))
     shown.print("the result")
@@ -269,7 +269,7 @@ def test_a_terminal_that_is_gone_is_an_error_at_the_next_view() -> None:
         def write(self, text: str) -> int:
             raise OSError("gone")
 
-    shown = Screen(Console(file=Gone(), width=80))
+    shown = OperatorScreen(Console(file=Gone(), width=80))
     shown.show(view(title="first"))
     written(shown)
     with pytest.raises(OSError, match="gone"):
@@ -309,20 +309,20 @@ def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[Terminal]:
 def test_a_key_asks_for_the_step_that_is_on_the_screen(
     terminal: Terminal, key: bytes, action: object
 ) -> None:
-    with Keys() as keys:
+    with Keyboard() as keys:
         assert keys.action(view()) is None
         terminal.type(key)
         assert keys.action(view()) == action
 
 
 def test_a_key_that_makes_no_sense_now_does_nothing(terminal: Terminal) -> None:
-    with Keys() as keys:
+    with Keyboard() as keys:
         terminal.type(b"\n")
         assert keys.action(view(actions=("skip",))) is None
 
 
 def test_q_aborts_only_when_it_comes_twice_in_a_row(terminal: Terminal) -> None:
-    with Keys() as keys:
+    with Keyboard() as keys:
         terminal.type(b"q")
         assert keys.action(view()) is None
         assert keys.asks
@@ -337,14 +337,14 @@ def test_q_aborts_only_when_it_comes_twice_in_a_row(terminal: Terminal) -> None:
 
 def test_keys_are_read_without_enter_and_the_terminal_is_given_back_as_it_was(terminal: Terminal) -> None:
     before = termios.tcgetattr(sys.stdin.fileno())
-    with Keys():
+    with Keyboard():
         assert not termios.tcgetattr(sys.stdin.fileno())[3] & termios.ICANON
     assert termios.tcgetattr(sys.stdin.fileno()) == before
 
 
 def test_without_a_terminal_there_are_no_keys(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stdin", open(os.devnull))  # noqa: SIM115
-    with Keys() as keys:
+    with Keyboard() as keys:
         assert not keys.there
         assert keys.action(view()) is None
     sys.stdin.close()

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.detection.acceptance import judge
+from calib.detection.acceptance import rejection_reasons
 from calib.detection.segments import find_segments
 from calib.procedure.engine import (
     Abort,
@@ -190,7 +190,7 @@ def test_the_verdict_is_that_of_the_segments_of_the_samples_that_it_names(
     assert rotation.angle_deg == pytest.approx(accepted.angle_deg, abs=1e-9)  # rounding of sums in pieces
     assert rotation.peak_deg_per_s == pytest.approx(accepted.peak_deg_per_s, abs=1e-9)
     procedure = plan()
-    assert judge(rotation, procedure.rotation_limits(procedure.steps[0]), "Z") == ()
+    assert rejection_reasons(rotation, procedure.rotation_limits(procedure.steps[0]), "Z") == ()
 
 
 def test_the_log_is_of_every_sample_from_the_end_of_the_alignment(drive: Drive, turned: Records) -> None:

@@ -6,26 +6,26 @@ import pytest
 from numpy.typing import NDArray
 from size_effect import size_effect_rate
 
-from calib.lever_arms import gauge
-from calib.lever_arms.gauge import GAUGES, Arms, Gauge, convert
+from calib.lever_arms import interchange
+from calib.lever_arms.gauge import GAUGES, Gauge, LeverArms, convert
 from calib.lever_arms.interchange import from_kalibr, from_psins, to_kalibr, to_psins
 from imudrv.errors import InputError
 from imudrv.units import MM
 
 Array = NDArray[np.float64]
-DIFFERENCES = np.kron([[1.0, -1.0, 0.0], [1.0, 0.0, -1.0]], np.eye(3))
+TO_DIFFERENCES = np.kron([[1.0, -1.0, 0.0], [1.0, 0.0, -1.0]], np.eye(3))
 POINT = (0.01, -0.02, 0.03)
 
 
-def arms(seed: int = 0) -> Arms:
+def arms(seed: int = 0) -> LeverArms:
     """Any three points with a covariance of rank 6, in gauge centroid."""
     rng = np.random.default_rng(seed)
     L = rng.normal(size=(9, 9)) * 0.01 * MM
-    loose = Arms(rng.normal(size=(3, 3)) * 30.0 * MM, L @ L.T, "given")
+    loose = LeverArms(rng.normal(size=(3, 3)) * 30.0 * MM, L @ L.T, "given")
     return convert(loose, "centroid")
 
 
-def converted(given: Arms, to: Gauge) -> Arms:
+def converted(given: LeverArms, to: Gauge) -> LeverArms:
     return convert(given, to, ("y", POINT) if to == "given" else None)
 
 
@@ -45,12 +45,14 @@ def test_there_and_back_is_the_same(to: Gauge, back: Gauge) -> None:
 @pytest.mark.parametrize("to", GAUGES)
 def test_the_differences_and_their_covariance_are_the_same_in_every_gauge(to: Gauge) -> None:
     start, there = arms(), converted(arms(), to)
-    np.testing.assert_allclose(DIFFERENCES @ there.r_b.ravel(), DIFFERENCES @ start.r_b.ravel(), atol=1e-16)
+    np.testing.assert_allclose(
+        TO_DIFFERENCES @ there.r_b.ravel(), TO_DIFFERENCES @ start.r_b.ravel(), atol=1e-16
+    )
     assert there.covariance is not None
     assert start.covariance is not None
     np.testing.assert_allclose(
-        DIFFERENCES @ there.covariance @ DIFFERENCES.T,
-        DIFFERENCES @ start.covariance @ DIFFERENCES.T,
+        TO_DIFFERENCES @ there.covariance @ TO_DIFFERENCES.T,
+        TO_DIFFERENCES @ start.covariance @ TO_DIFFERENCES.T,
         atol=1e-22,
     )
     assert np.linalg.matrix_rank(there.covariance) == 6
@@ -72,7 +74,7 @@ def test_the_map_of_the_covariance_is_that_of_the_points() -> None:
     rng, start = np.random.default_rng(5), arms()
     assert start.covariance is not None
     draws = rng.multivariate_normal(start.r_b.ravel(), start.covariance, 4000, method="eigh")
-    moved = np.array([convert(Arms(d.reshape(3, 3), None, "centroid"), "z").r_b.ravel() for d in draws])
+    moved = np.array([convert(LeverArms(d.reshape(3, 3), None, "centroid"), "z").r_b.ravel() for d in draws])
     expected = convert(start, "z").covariance
     assert expected is not None
     # 1 / sqrt(2000) = 2.2 % of the largest variance, four times
@@ -96,11 +98,11 @@ def test_a_gauge_that_makes_no_sense_is_refused(to: Any, stated: Any, message: s
 
 
 def test_arms_without_covariance_stay_without() -> None:
-    assert convert(Arms(np.eye(3), None, "given"), "y").covariance is None
+    assert convert(LeverArms(np.eye(3), None, "given"), "y").covariance is None
 
 
 def test_the_worked_example_is_true() -> None:
-    assert doctest.testmod(gauge).failed == 0
+    assert doctest.testmod(interchange).failed == 0
 
 
 def test_kalibr_has_x_as_origin_and_its_points_come_back() -> None:
@@ -127,10 +129,10 @@ def kalibr_size_effect(accelerometers: dict[str, list[float]], omega: Array, ome
 def psins_size_effect(clbt: dict[str, list[float]], omega: Array, omega_dot: Array) -> Array:
     """What `imuclbt` takes off the specific force: `SS [rx; ry; rz]` of imulvS.m, Cba = I."""
 
-    def askew(v: Array) -> Array:
+    def skew_trials(v: Array) -> Array:
         return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
-    W = askew(omega_dot) + askew(omega) @ askew(omega)
+    W = skew_trials(omega_dot) + skew_trials(omega) @ skew_trials(omega)
     SS = np.zeros((3, 9))
     for k in range(3):
         SS[k, 3 * k : 3 * k + 3] = W[k]

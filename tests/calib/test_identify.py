@@ -12,12 +12,13 @@ import yaml
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from calib.detection.acceptance import Limits
-from calib.estimation.joint import Noise, joint
-from calib.estimation.plain import plain
-from calib.estimation.predict import Planned, predict
-from calib.estimation.result import DIFFERENCES, SHIFT_FREE, Identification
-from calib.estimation.runs import Priors, Run, collect
+from calib.detection.acceptance import RotationLimits
+from calib.detection.noise import Noise
+from calib.estimation.joint import estimate_joint
+from calib.estimation.plain import estimate_plain
+from calib.estimation.predict import PlannedRotation, predict
+from calib.estimation.result import CENTROID_BASIS, TO_DIFFERENCES, LeverArmEstimate
+from calib.estimation.runs import Priors, Run, navigate_rotations
 from imudrv import profiles
 from imudrv.calibration import coefficients, read_calibration
 from imudrv.capture import Capture
@@ -31,7 +32,11 @@ from imudrv.units import DEG, DEG_PER_H, MM, PPM, STANDARD_GRAVITY, UG, URAD
 
 Array = NDArray[np.float64]
 
-THREE = (Planned("+Z", after_s=12.0), Planned("+X", after_s=12.0), Planned("+Y", after_s=12.0))
+THREE = (
+    PlannedRotation("+Z", after_s=12.0),
+    PlannedRotation("+X", after_s=12.0),
+    PlannedRotation("+Y", after_s=12.0),
+)
 BOTH = (*THREE, *(replace(planned, angle_deg=-180.0) for planned in THREE))
 LATITUDE = 28.2 * DEG
 
@@ -72,18 +77,18 @@ def captured(reference: Path) -> tuple[list[Run], Array]:
             compensator = Compensator(known, capture.layout, rate_filter("causal", interval_ns))
             return capture.increments(compensator, lambda _: None)
 
-        runs += collect(read, known.C_ba, site, label=name).runs
+        runs += navigate_rotations(read, known.C_ba, site, label=name).runs
     r_mm = yaml.safe_load((reference / "truth.yaml").read_text())["r_mm"]
     return runs, np.array([r_mm[axis] for axis in "xyz"]) * MM
 
 
-def rms_mm(found: Identification, truth: Array) -> float:
+def rms_mm(found: LeverArmEstimate, truth: Array) -> float:
     return float(np.sqrt(((found.R_b - truth) ** 2).mean())) / MM
 
 
 def refused(runs: Sequence[Run], **options: Any) -> str:
     with pytest.raises(InputError) as caught:
-        joint(runs, **options)
+        estimate_joint(runs, **options)
     return str(caught.value)
 
 
@@ -92,14 +97,14 @@ def refused(runs: Sequence[Run], **options: Any) -> str:
 
 def test_joint_finds_the_arms_of_the_reference_captures(captured: tuple[list[Run], Array]) -> None:
     runs, truth = captured
-    found = joint(runs)
+    found = estimate_joint(runs)
     assert rms_mm(found, truth) < 0.05  # the requirement; the predicted sigma is 0.012
     assert found.rank == 6
     # one direction is that in which a skew of the size of its prior acts, the unit 0.1 m off the axis
     assert found.reason.startswith("rank 6: the directions seen have a sigma of 0.1")
     assert found.direction_sigma[4] < 0.03 * MM
     assert found.direction_sigma[6] > 1.0
-    error = found.differences.ravel() - DIFFERENCES @ truth.ravel()
+    error = found.differences.ravel() - TO_DIFFERENCES @ truth.ravel()
     assert error @ np.linalg.solve(found.differences_covariance, error) < chi2.ppf(0.999, 6)
     # 246 degrees of freedom, and noise known to some 10 %
     assert 0.7 < found.chi_square / found.degrees_of_freedom < 1.4
@@ -108,10 +113,10 @@ def test_joint_finds_the_arms_of_the_reference_captures(captured: tuple[list[Run
 
 def test_plain_finds_them_as_the_literature_does(captured: tuple[list[Run], Array]) -> None:
     runs, truth = captured
-    found = plain(runs)
+    found = estimate_plain(runs)
     assert rms_mm(found, truth) < 0.6  # the requirement
     assert found.rank == 6
-    error = found.differences.ravel() - DIFFERENCES @ truth.ravel()
+    error = found.differences.ravel() - TO_DIFFERENCES @ truth.ravel()
     assert error @ np.linalg.solve(found.differences_covariance, error) < chi2.ppf(0.999, 6)
     # six equations for six unknowns: nothing is left over
     assert found.degrees_of_freedom == 0
@@ -119,13 +124,13 @@ def test_plain_finds_them_as_the_literature_does(captured: tuple[list[Run], Arra
 
 
 def test_compensation_takes_nearly_all_of_the_velocity(captured: tuple[list[Run], Array]) -> None:
-    for run in joint(captured[0]).runs:
+    for run in estimate_joint(captured[0]).runs:
         # left is what bias and misalignment do in 3 s
         assert np.hypot(*run.compensated_n[:2]) < 0.05 * np.hypot(*run.V_n[:2])
         # what the estimate says of the velocity fits it within noise, a random walk over 25 s
         assert np.abs(run.v_n - run.fitted_n).max() < 1e-3
         assert len(run.t_s) == len(run.v_n) == len(run.fitted_n)
-    assert [run.axis for run in joint(captured[0]).runs] == ["+Z", "+X", "+Y"]
+    assert [run.axis for run in estimate_joint(captured[0]).runs] == ["+Z", "+X", "+Y"]
 
 
 # --- what the rotations see ---
@@ -135,7 +140,7 @@ def test_a_common_shift_is_the_only_thing_that_six_rotations_do_not_see(
     simulated: tuple[list[Run], Array],
 ) -> None:
     runs, truth = simulated
-    for found in (joint(runs), plain(runs)):
+    for found in (estimate_joint(runs), estimate_plain(runs)):
         assert found.rank == 6
         assert found.gauge == "centroid"
         np.testing.assert_allclose(found.R_b.sum(axis=0), 0.0, atol=1e-15)
@@ -143,8 +148,8 @@ def test_a_common_shift_is_the_only_thing_that_six_rotations_do_not_see(
         assert found.direction_sigma[6] > 100.0 * found.direction_sigma[5]
         assert found.singular_values[5] > 1.0
         assert found.singular_values[6] < 1e-3
-    np.testing.assert_allclose(SHIFT_FREE.T @ np.tile(np.eye(3), (3, 1)), 0.0, atol=1e-15)
-    assert rms_mm(joint(runs), truth) < 0.04  # predicted 0.011
+    np.testing.assert_allclose(CENTROID_BASIS.T @ np.tile(np.eye(3), (3, 1)), 0.0, atol=1e-15)
+    assert rms_mm(estimate_joint(runs), truth) < 0.04  # predicted 0.011
 
 
 def test_nine_components_without_a_known_pivot_are_refused(simulated: tuple[list[Run], Array]) -> None:
@@ -163,7 +168,7 @@ def test_rotations_about_too_few_axes_are_refused_with_the_directions_unseen(
     # one axis, both signs: what its lean of 3 mrad shows of a third direction is too little
     assert "got 2" in refused([runs[0], runs[3]])
     with pytest.raises(InputError, match="got 4"):
-        plain(runs[:2])
+        estimate_plain(runs[:2])
     assert "expected one good rotation at least, got none" in refused([])
 
 
@@ -171,11 +176,11 @@ def test_without_one_of_three_rotations_there_is_no_result_without_one_of_six_ne
     simulated: tuple[list[Run], Array],
 ) -> None:
     runs = simulated[0]
-    three, six = joint(runs[:3]), joint(runs)
-    assert [(left.rank, left.shift_m) for left in three.left_out] == [(4, None)] * 3
-    for k, left in enumerate(six.left_out):
+    three, six = estimate_joint(runs[:3]), estimate_joint(runs)
+    assert [(left.rank, left.shift_m) for left in three.leave_one_out] == [(4, None)] * 3
+    for k, left in enumerate(six.leave_one_out):
         assert left.rank == 6
-        without = joint([run for j, run in enumerate(runs) if j != k])
+        without = estimate_joint([run for j, run in enumerate(runs) if j != k])
         assert left.shift_m is not None
         # the noise is pooled over other rests
         np.testing.assert_allclose(left.shift_m, without.R_b - six.R_b, atol=3e-3 * MM)
@@ -184,20 +189,20 @@ def test_without_one_of_three_rotations_there_is_no_result_without_one_of_six_ne
 
 def test_the_order_of_the_runs_does_not_matter(simulated: tuple[list[Run], Array]) -> None:
     runs = simulated[0]
-    a, b = joint(runs), joint(runs[::-1])
+    a, b = estimate_joint(runs), estimate_joint(runs[::-1])
     np.testing.assert_allclose(a.R_b, b.R_b, atol=1e-10)
     np.testing.assert_allclose(a.covariance, b.covariance, atol=1e-15)
     assert a.chi_square == pytest.approx(b.chi_square, rel=1e-6)
 
 
 def test_correlations_are_correlations(simulated: tuple[list[Run], Array]) -> None:
-    found = joint(simulated[0])
-    assert found.correlation.shape == (9, len(found.nuisances))
+    found = estimate_joint(simulated[0])
+    assert found.correlation.shape == (9, len(found.parameters))
     assert np.abs(found.correlation).max() <= 1.0 + 1e-9
     assert np.abs(found.correlation).max() > 0.01
-    by_name = {n.name: n for n in found.nuisances}
+    by_name = {n.name: n for n in found.parameters}
     assert by_name["accelerometer_bias_x"].prior == Priors().accelerometer_bias
-    assert all(n.sigma <= n.prior * (1.0 + 1e-9) for n in found.nuisances)
+    assert all(n.sigma <= n.prior * (1.0 + 1e-9) for n in found.parameters)
 
 
 # --- accuracy, and whether it is what is said ---
@@ -251,8 +256,8 @@ def test_a_skew_of_one_sample_is_within_the_uncertainty(
     for seed in range(400, 404):
         runs, truth = montecarlo.case(seed, signs, montecarlo.BUDGETS["standard"])
         for skew in worst:
-            found = joint(runs, Priors(skew=skew))
-            error = found.differences.ravel() - DIFFERENCES @ truth.ravel()
+            found = estimate_joint(runs, Priors(skew=skew))
+            error = found.differences.ravel() - TO_DIFFERENCES @ truth.ravel()
             worst[skew] = max(worst[skew], float(np.abs(error / found.differences_sigma.ravel()).max()))
     # twice the prior's sigma: three rotations do not determine the skew, six do
     assert worst[Priors().skew] < sigmas
@@ -280,9 +285,9 @@ def test_dither_of_the_blocks_left_in_the_increments_does_no_harm(
     montecarlo: ModuleType, amplitude_arcsec: float
 ) -> None:
     runs, truth = shaken(montecarlo, amplitude_arcsec, 400.0)
-    found = joint(runs)
+    found = estimate_joint(runs)
     assert found.refusals == ()
-    error = found.differences.ravel() - DIFFERENCES @ truth.ravel()
+    error = found.differences.ravel() - TO_DIFFERENCES @ truth.ravel()
     # 22 and 2100 sigma when the causal rate rectified it
     assert np.abs(error / found.differences_sigma.ravel()).max() < 3.0
 
@@ -290,10 +295,10 @@ def test_dither_of_the_blocks_left_in_the_increments_does_no_harm(
 def test_a_shaking_that_the_filter_passes_is_refused(
     montecarlo: ModuleType, simulated: tuple[list[Run], Array]
 ) -> None:
-    assert joint(simulated[0]).refusals == ()
-    assert max(run.H_rest for run in joint(simulated[0]).runs) < 5e-4  # a quarter of the limit
+    assert estimate_joint(simulated[0]).refusals == ()
+    assert max(run.H_rest for run in estimate_joint(simulated[0]).runs) < 5e-4  # a quarter of the limit
     runs, _ = shaken(montecarlo, 3.0, 150.0)
-    for found in (joint(runs), plain(runs)):
+    for found in (estimate_joint(runs), estimate_plain(runs)):
         assert len(found.refusals) == 1
         assert found.refusals[0].startswith("the gyro increments carry dither or vibration")
 
@@ -302,7 +307,7 @@ def test_a_shaking_that_the_filter_passes_is_refused(
 
 
 def test_a_plan_predicts_what_the_data_then_give(simulated: tuple[list[Run], Array]) -> None:
-    found = joint(simulated[0])
+    found = estimate_joint(simulated[0])
     predicted = predict(BOTH, LATITUDE, found.noise)
     # the plan knows neither tilts nor how well the heading was aligned
     np.testing.assert_allclose(predicted.differences_sigma, found.differences_sigma, rtol=0.1)
@@ -337,7 +342,7 @@ def test_slower_rotations_and_fewer_predict_more() -> None:
         ((replace(THREE[0], after_s=0.1),), "a rest of 0.5 s at least"),
     ],
 )
-def test_a_plan_that_cannot_do_is_refused(plan: Sequence[Planned], message: str) -> None:
+def test_a_plan_that_cannot_do_is_refused(plan: Sequence[PlannedRotation], message: str) -> None:
     with pytest.raises(InputError, match=message):
         predict(plan, LATITUDE, Noise(6e-7, 5e-5, 5e-6, 1.4e-4))
 
@@ -368,7 +373,7 @@ def turntable(montecarlo: ModuleType) -> Callable[..., tuple[list[Run], Array]]:
 
 def test_a_known_pivot_makes_all_nine_observable(turntable: Callable[..., tuple[list[Run], Array]]) -> None:
     runs, truth = turntable(0.0)
-    found = joint(runs, pivot="fixed", nine=True)
+    found = estimate_joint(runs, pivot="fixed", nine=True)
     assert found.rank == 9
     assert found.gauge == "given"
     error = (found.R_b - truth).ravel()
@@ -386,14 +391,14 @@ def test_a_pivot_that_did_not_stay_still_is_refused(
 
 
 def test_what_the_data_cannot_tell_is_said(simulated: tuple[list[Run], Array]) -> None:
-    found = joint(simulated[0], extra=("quadratic",))
+    found = estimate_joint(simulated[0], extra=("quadratic",))
     # a quadratic term is a bias where one axis is always up
     assert len(found.notes) == 3
     assert found.notes[0].startswith("quadratic_x not observable in these runs: sigma ")
     assert found.notes[0].endswith(" ug/g^2")
     # and what cannot be told does no harm
-    np.testing.assert_allclose(found.R_b, joint(simulated[0]).R_b, atol=1e-3 * MM)
-    assert joint(simulated[0]).notes == ()
+    np.testing.assert_allclose(found.R_b, estimate_joint(simulated[0]).R_b, atol=1e-3 * MM)
+    assert estimate_joint(simulated[0]).notes == ()
 
 
 def test_a_skew_is_seen_with_a_known_pivot(montecarlo: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -405,8 +410,8 @@ def test_a_skew_is_seen_with_a_known_pivot(montecarlo: ModuleType, monkeypatch: 
 
     monkeypatch.setattr(montecarlo, "scenario", skewed)
     runs, truth = montecarlo.case(3, (1,), replace(montecarlo.BUDGETS["standard"], pivot_mm=0.0))
-    found = joint(runs, Priors(skew=5e-3), pivot="fixed")
-    skew = next(n for n in found.nuisances if n.name == "skew_s")
+    found = estimate_joint(runs, Priors(skew=5e-3), pivot="fixed")
+    skew = next(n for n in found.parameters if n.name == "skew_s")
     assert skew.seen
     assert skew.value == pytest.approx(3e-3, abs=4.0 * skew.sigma)
     assert skew.sigma < 0.6e-3
@@ -439,16 +444,16 @@ def test_a_turntable_run_gives_all_nine_with_every_other_error(positions: Record
         gyro_misalignment=500.0 * URAD,
     )
     # quarter turns about level axes, 10 deg/s
-    limits = Limits(angle_tolerance_deg=np.inf, least_peak_deg_per_s=0.0, axis_tilt_deg=90.0)
+    limits = RotationLimits(angle_tolerance_deg=np.inf, least_peak_deg_per_s=0.0, axis_tilt_deg=90.0)
     site = Site(latitude_deg=34.0, longitude_deg=0.0, height_m=0.0)
-    runs = collect(lambda: [positions], np.eye(3), site, limits=limits, priors=priors).runs
+    runs = navigate_rotations(lambda: [positions], np.eye(3), site, limits=limits, priors=priors).runs
     assert len(runs) == 18
-    found = joint(runs, priors, pivot="fixed", nine=True, extra=("quadratic",))
+    found = estimate_joint(runs, priors, pivot="fixed", nine=True, extra=("quadratic",))
     truth = -np.array([[10.0, 20.0, 30.0], [40.0, 50.0, 60.0], [0.0, 0.0, 0.0]]) * MM
     assert found.rank == 9
     assert found.notes == ()
     assert np.abs(found.R_b - truth).max() < 0.2 * MM  # the requirement; 0.05 found
-    value = {n.name: n.value for n in found.nuisances}
+    value = {n.name: n.value for n in found.parameters}
     # The data were made by a calibration of (10, 20, 30) applied to perfect data: errors are its negative.
     # Its gyro-accelerometer delay is what is called skew here.
     assert value["skew_s"] == pytest.approx(1e-3, abs=0.02e-3)  # the requirement

@@ -8,10 +8,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from calib.bench.technician import Mistake, technician
-from calib.estimation.joint import joint
-from calib.estimation.result import DIFFERENCES, Identification
-from calib.estimation.runs import collect
+from calib.bench.technician import Mistake, technician_scenario
+from calib.estimation.joint import estimate_joint
+from calib.estimation.result import TO_DIFFERENCES, LeverArmEstimate
+from calib.estimation.runs import navigate_rotations
 from calib.procedure.engine import Accepted, Engine, Event, Finished, Phase, Rejected, Restarted
 from calib.procedure.plan import load, predicted
 from calib.procedure.schema import Procedure
@@ -45,9 +45,9 @@ class Performance:
         calibration = self.scenario.unit.calibration
         assert calibration is not None
         assert calibration.size_effect is not None
-        return DIFFERENCES @ calibration.size_effect.r_m.ravel()
+        return TO_DIFFERENCES @ calibration.size_effect.r_m.ravel()
 
-    def identified(self) -> Identification:
+    def identified(self) -> LeverArmEstimate:
         """From the samples that the accepted events name, as from a recording."""
         calibration = self.scenario.unit.calibration
         assert calibration is not None
@@ -56,7 +56,7 @@ class Performance:
             accepted = self.engine.accepted[step.id]
             counter = self.samples["counter"]
             inside = (counter >= accepted.first_counter) & (counter <= accepted.last_counter)
-            evidence = collect(
+            evidence = navigate_rotations(
                 lambda inside=inside: [self.samples[inside]],
                 calibration.accelerometer.C_ba_array,
                 self.scenario.site,
@@ -67,7 +67,7 @@ class Performance:
             assert len(evidence.runs) == 1
             assert not evidence.rejected
             runs += evidence.runs
-        return joint(runs)
+        return estimate_joint(runs)
 
 
 def samples_of(scenario: Scenario) -> Records:
@@ -87,7 +87,7 @@ def samples_of(scenario: Scenario) -> Records:
 
 
 def perform(procedure: Procedure, mistakes: Sequence[Mistake] = (), seed: int = 1) -> Performance:
-    scenario = technician(procedure, mistakes, seed=seed)
+    scenario = technician_scenario(procedure, mistakes, seed=seed)
     samples = samples_of(scenario)
     engine = Engine(
         procedure, scenario.site, scenario.unit.calibration, interval_ns=LAYOUT.interval_ns, hands_free=True
@@ -215,7 +215,7 @@ def test_each_mistake_is_caught_named_and_made_good(name: str) -> None:
 
 def test_a_mistake_in_a_step_that_there_is_not_is_refused() -> None:
     with pytest.raises(InputError, match=r"different steps of z-up, x-up, y-up, got z-down"):
-        technician(short(), [Mistake("z-down", "slow")])
+        technician_scenario(short(), [Mistake("z-down", "slow")])
 
 
 def test_a_procedure_that_begins_upside_down_is_rehearsed_too() -> None:
@@ -230,7 +230,7 @@ def test_a_procedure_that_begins_upside_down_is_rehearsed_too() -> None:
 
 
 def test_the_true_arms_are_drawn_in_gauge_centroid_and_the_unit_is_the_same_for_a_seed() -> None:
-    a, b, other = (technician(short(), seed=seed) for seed in (4, 4, 5))
+    a, b, other = (technician_scenario(short(), seed=seed) for seed in (4, 4, 5))
 
     assert a == b
     assert a.unit.calibration != other.unit.calibration

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from rich.cells import cell_len
 
-from calib.estimation.result import LeftOut
-from calib.identification import Basis, Findings, find
-from calib.lever_arms.gauge import Arms, convert
+from calib.estimation.result import LeaveOneOut
+from calib.identification import IdentificationResult, PriorCalibration, identify_captures
+from calib.lever_arms.gauge import LeverArms, convert
 from calib.reports.identification import arms_text, report_html, report_text, verdict
 from imudrv import profiles
 from imudrv.cli import main as imudrv
@@ -39,7 +39,7 @@ unit:
 
 
 @pytest.fixture(scope="module")
-def findings(tmp_path_factory: pytest.TempPathFactory) -> Findings:
+def findings(tmp_path_factory: pytest.TempPathFactory) -> IdentificationResult:
     """Three poses, a hostile file name, a unit whose number is markup; a second, small turn in each."""
     folder = tmp_path_factory.mktemp("report")
     captures = []
@@ -50,16 +50,18 @@ def findings(tmp_path_factory: pytest.TempPathFactory) -> Findings:
         assert imudrv(["sim", str(folder / "run.yaml"), "--profile", "imu50-rs422", *out]) == 0
     unit = NOMINAL.model_copy(update={"serial_number": "50<b>&17"})
     site = Site(latitude_deg=28.2, longitude_deg=113.0, height_m=60.0)
-    return find(captures, profiles.load("imu50-rs422"), Basis(unit, "<u>.yaml", "0f" * 32), site)
+    return identify_captures(
+        captures, profiles.load("imu50-rs422"), PriorCalibration(unit, "<u>.yaml", "0f" * 32), site
+    )
 
 
 @pytest.fixture(scope="module")
-def arms(findings: Findings) -> tuple[Arms, Arms]:
+def arms(findings: IdentificationResult) -> tuple[LeverArms, LeverArms]:
     return findings.arms, convert(findings.arms, "x")
 
 
 @pytest.fixture(scope="module")
-def page(findings: Findings, arms: tuple[Arms, Arms]) -> str:
+def page(findings: IdentificationResult, arms: tuple[LeverArms, LeverArms]) -> str:
     return report_html(findings, arms)
 
 
@@ -107,7 +109,9 @@ def test_its_figures_are_whole_drawings_that_load_nothing_either(page: str) -> N
         assert not re.search(r'(?:href|src)="(?!#)', drawing)
 
 
-def test_what_comes_from_files_is_escaped(page: str, findings: Findings, arms: tuple[Arms, Arms]) -> None:
+def test_what_comes_from_files_is_escaped(
+    page: str, findings: IdentificationResult, arms: tuple[LeverArms, LeverArms]
+) -> None:
     assert "<img src=x" not in page
     assert "&lt;img src=x onerror=alert(1)&gt;&amp;" in page
     assert "50&lt;b&gt;&amp;17" in page
@@ -115,7 +119,9 @@ def test_what_comes_from_files_is_escaped(page: str, findings: Findings, arms: t
     assert "\x1b" not in report_text(findings, arms)
 
 
-def test_the_text_fits_80_columns_whatever_the_names(findings: Findings, arms: tuple[Arms, Arms]) -> None:
+def test_the_text_fits_80_columns_whatever_the_names(
+    findings: IdentificationResult, arms: tuple[LeverArms, LeverArms]
+) -> None:
     text = report_text(findings, arms)
     assert max(map(cell_len, text.splitlines())) <= 80
     assert not re.search(r"[ \t]$", text, re.MULTILINE)
@@ -123,33 +129,39 @@ def test_the_text_fits_80_columns_whatever_the_names(findings: Findings, arms: t
 
 
 def test_a_report_is_a_function_of_the_findings(
-    page: str, findings: Findings, arms: tuple[Arms, Arms]
+    page: str, findings: IdentificationResult, arms: tuple[LeverArms, LeverArms]
 ) -> None:
     assert report_html(findings, arms) == page
 
 
-def test_text_and_page_tell_the_same_numbers(page: str, findings: Findings, arms: tuple[Arms, Arms]) -> None:
+def test_text_and_page_tell_the_same_numbers(
+    page: str, findings: IdentificationResult, arms: tuple[LeverArms, LeverArms]
+) -> None:
     numbers = re.compile(r"[+-]\d+\.\d+")
     body = re.sub(r'src="[^"]*"|<style>.*</style>', "", page, flags=re.DOTALL)
     assert set(numbers.findall(report_text(findings, arms))) == set(numbers.findall(body))
 
 
-def test_nine_numbers_never_stand_without_their_gauge(findings: Findings, arms: tuple[Arms, Arms]) -> None:
+def test_nine_numbers_never_stand_without_their_gauge(
+    findings: IdentificationResult, arms: tuple[LeverArms, LeverArms]
+) -> None:
     text = report_text(findings, arms)
     heads = [line for line in text.splitlines() if line.startswith("  Sensing points in body axes")]
     assert heads == [f"  Sensing points in body axes, mm, gauge {gauge}" for gauge in ("centroid", "x")]
     assert len(re.findall(r"^  r_x  ", text, re.MULTILINE)) == 2
     assert "gauge x" in arms_text(arms[1])
-    assert "gauge x" in arms_text(Arms(arms[1].r_b, None, "x"))
+    assert "gauge x" in arms_text(LeverArms(arms[1].r_b, None, "x"))
 
 
-def test_every_rotation_is_told_with_verdict_or_reason(findings: Findings, arms: tuple[Arms, Arms]) -> None:
+def test_every_rotation_is_told_with_verdict_or_reason(
+    findings: IdentificationResult, arms: tuple[LeverArms, LeverArms]
+) -> None:
     text = " ".join(report_text(findings, arms).split())
     assert text.count("serves: within all limits") == 3
     assert text.count("turned 30.0 deg, want 180 +- 5") == 3
 
 
-def test_the_verdict_is_bad_where_the_data_contradict_the_model(findings: Findings) -> None:
+def test_the_verdict_is_bad_where_the_data_contradict_the_model(findings: IdentificationResult) -> None:
     n = findings.result.degrees_of_freedom
     marks = {}
     for ratio in (0.5, 1.0, 1.5, 3.0):
@@ -160,7 +172,7 @@ def test_the_verdict_is_bad_where_the_data_contradict_the_model(findings: Findin
     assert "No certificate is made" in marks[3.0][1]
 
 
-def test_increments_that_carry_dither_are_bad_with_the_remedy(findings: Findings) -> None:
+def test_increments_that_carry_dither_are_bad_with_the_remedy(findings: IdentificationResult) -> None:
     runs = findings.result.runs
     shaken = replace(findings.result, runs=(replace(runs[0], H_rest=0.07), *runs[1:]))
     bad = [text for mark, text in verdict(replace(findings, result=shaken)) if mark == "bad"]
@@ -170,7 +182,7 @@ def test_increments_that_carry_dither_are_bad_with_the_remedy(findings: Findings
     assert "let the unit remove its dither" in bad[0]
 
 
-def test_three_rotations_end_without_a_caution_that_is_not_true(findings: Findings) -> None:
+def test_three_rotations_end_without_a_caution_that_is_not_true(findings: IdentificationResult) -> None:
     marks = list(verdict(findings))
     assert {mark for mark, _ in marks} == {"good", "note"}
     notes = " ".join(text for mark, text in marks if mark == "note")
@@ -179,18 +191,20 @@ def test_three_rotations_end_without_a_caution_that_is_not_true(findings: Findin
     assert "agree with the model" not in " ".join(text for _, text in marks)
 
 
-def test_a_rotation_that_could_be_left_out_is_told_with_its_change(findings: Findings) -> None:
+def test_a_rotation_that_could_be_left_out_is_told_with_its_change(findings: IdentificationResult) -> None:
     shift = np.zeros((3, 3))
     shift[1, 2] = -0.02 * MM
-    result = replace(findings.result, left_out=(LeftOut("z#1", 6, shift), LeftOut("x#1", 4, None)))
+    result = replace(
+        findings.result, leave_one_out=(LeaveOneOut("z#1", 6, shift), LeaveOneOut("x#1", 4, None))
+    )
     told = [text for mark, text in verdict(replace(findings, result=result)) if mark == "note"]
     assert told[0] == "Leaving out one rotation changes no component by more than 0.020 mm (z#1)."
 
 
-def test_digits_follow_the_uncertainty(findings: Findings) -> None:
+def test_digits_follow_the_uncertainty(findings: IdentificationResult) -> None:
     r_b = np.full((3, 3), 1.23456789 * MM)
-    coarse = arms_text(Arms(r_b, np.diag(np.full(9, (0.25 * MM) ** 2)), "given"))
-    fine = arms_text(Arms(r_b, np.diag(np.full(9, (0.0123 * MM) ** 2)), "given"))
+    coarse = arms_text(LeverArms(r_b, np.diag(np.full(9, (0.25 * MM) ** 2)), "given"))
+    fine = arms_text(LeverArms(r_b, np.diag(np.full(9, (0.0123 * MM) ** 2)), "given"))
     assert "+1.23  +1.23  +1.23  0.25" in coarse
     assert "+1.235  +1.235  +1.235  0.012" in fine
 

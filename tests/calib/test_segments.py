@@ -5,14 +5,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.detection.acceptance import Limits, expected_error_mm, judge
+from calib.detection.acceptance import RotationLimits, expected_error_mm, rejection_reasons
 from calib.detection.segments import Rotation, Segments, find_segments
 from imudrv.errors import InputError
 from imudrv.records import Flag, Records
 
 Bench = Callable[..., Records]
 Step = Callable[..., Any]
-LIMITS = Limits()
+LIMITS = RotationLimits()
 
 
 def only(segments: Segments) -> Rotation:
@@ -27,7 +27,7 @@ def test_a_half_turn_is_found_with_its_angle_sign_and_axis(
 ) -> None:
     found = find_segments([bench(step(40.0), step(2.5, angle), step(8.0), up=up)])
     rotation = only(found)
-    assert judge(rotation, LIMITS) == ()
+    assert rejection_reasons(rotation, LIMITS) == ()
     # blocks of 20 ms; the quintic's very ends are slower than the noise
     assert rotation.start_s == pytest.approx(40.0, abs=0.06)
     assert rotation.stop_s == pytest.approx(42.5, abs=0.06)
@@ -73,13 +73,13 @@ def test_each_rejection_has_its_number_and_its_limit(
     bench: Bench, step: Step, steps: list[tuple[Any, ...]], reason: str
 ) -> None:
     rotation = only(find_segments([bench(*(step(*s) for s in steps))]))
-    assert reason in judge(rotation, LIMITS)
+    assert reason in rejection_reasons(rotation, LIMITS)
 
 
 def test_another_axis_than_the_procedure_wants_is_told(bench: Bench, step: Step) -> None:
     rotation = only(find_segments([bench(step(40.0), step(2.5, 180.0), step(8.0), up="+Y")]))
-    assert judge(rotation, LIMITS, expected="Y") == ()
-    assert judge(rotation, LIMITS, expected="Z") == ("about Y, expected Z",)
+    assert rejection_reasons(rotation, LIMITS, expected="Y") == ()
+    assert rejection_reasons(rotation, LIMITS, expected="Z") == ("about Y, expected Z",)
 
 
 def test_missing_samples_and_flags_in_the_rotation_are_told(bench: Bench, step: Step) -> None:
@@ -88,7 +88,7 @@ def test_missing_samples_and_flags_in_the_rotation_are_told(bench: Bench, step: 
     kept = np.delete(data, [turning, turning + 40, turning + 41])
     kept["flags"][turning + 5] |= Flag.SATURATED
     kept["flags"][turning + 6] |= Flag.FAULT
-    assert judge(only(find_segments([kept])), LIMITS) == (
+    assert rejection_reasons(only(find_segments([kept])), LIMITS) == (
         "3 samples missing during the rotation, want 0 at most",
         "an axis saturated during the rotation",
         "the unit told a fault during the rotation",
@@ -100,7 +100,7 @@ def test_a_sample_that_bridges_a_gap_leaves_nothing_missing(bench: Bench, step: 
     at = 41 * 500
     for name in ("interval_ns", "dtheta_b", "dv_b"):
         data[name][at + 1] += data[name][at]
-    assert judge(only(find_segments([np.delete(data, at)])), LIMITS) == ()
+    assert rejection_reasons(only(find_segments([np.delete(data, at)])), LIMITS) == ()
 
 
 def test_a_bump_ends_a_rest_and_is_no_rotation(bench: Bench, step: Step) -> None:
@@ -113,8 +113,8 @@ def test_a_bump_ends_a_rest_and_is_no_rotation(bench: Bench, step: Step) -> None
         step(8.0),
     )
     bump, rotation = find_segments([bumped]).rotations
-    assert "turned 0.0 deg, want 180 +- 5" in judge(bump, LIMITS)
-    assert judge(rotation, LIMITS) == ("rest before 25.0 s, want 32",)
+    assert "turned 0.0 deg, want 180 +- 5" in rejection_reasons(bump, LIMITS)
+    assert rejection_reasons(rotation, LIMITS) == ("rest before 25.0 s, want 32",)
 
 
 def test_a_shift_that_gyros_do_not_feel_ends_a_rest_too(bench: Bench, step: Step) -> None:
@@ -127,12 +127,12 @@ def test_a_shift_that_gyros_do_not_feel_ends_a_rest_too(bench: Bench, step: Step
 
 def test_two_pushes_with_a_short_pause_are_one_rotation(bench: Bench, step: Step) -> None:
     data = bench(step(40.0), step(1.3, 90.0), step(0.5), step(1.3, 90.0), step(8.0))
-    assert judge(only(find_segments([data])), LIMITS) == ()
+    assert rejection_reasons(only(find_segments([data])), LIMITS) == ()
 
 
 def test_two_pushes_with_a_rest_between_are_two_that_do_not_serve(bench: Bench, step: Step) -> None:
     data = bench(step(40.0), step(1.3, 90.0), step(3.0), step(1.3, 90.0), step(8.0))
-    first, second = (judge(r, LIMITS) for r in find_segments([data]).rotations)
+    first, second = (rejection_reasons(r, LIMITS) for r in find_segments([data]).rotations)
     assert first == ("turned 90.0 deg, want 180 +- 5", "rest after 3.0 s, want 5")
     assert second == ("turned 90.0 deg, want 180 +- 5", "rest before 3.0 s, want 32")
 
@@ -151,9 +151,9 @@ def test_placing_the_unit_between_rotations_is_no_rotation(bench: Bench, step: S
     )
     found = find_segments([data])
     first, placing, second = found.rotations
-    assert judge(first, LIMITS) == ()
-    assert judge(second, LIMITS) == ()
-    reasons = judge(placing, LIMITS)
+    assert rejection_reasons(first, LIMITS) == ()
+    assert rejection_reasons(second, LIMITS) == ()
+    reasons = rejection_reasons(placing, LIMITS)
     assert any("off the vertical" in reason for reason in reasons)
     assert placing.about == "Y"
     assert found.rests[1].up == "+Z"
@@ -167,7 +167,7 @@ def test_a_capture_that_begins_in_motion_still_gives_its_rotation(bench: Bench, 
     )
     moving, rotation = find_segments([data]).rotations
     assert moving.before is None
-    assert judge(rotation, LIMITS) == ()
+    assert rejection_reasons(rotation, LIMITS) == ()
 
 
 def test_a_long_gap_is_no_rest(bench: Bench, step: Step) -> None:
@@ -187,7 +187,7 @@ def test_a_leap_of_the_counter_costs_no_memory(bench: Bench, step: Step) -> None
 @pytest.mark.parametrize("times", [0.0, 1.0, 20.0])
 def test_the_noise_floor_is_the_datas_own(bench: Bench, step: Step, times: float) -> None:
     data = bench(step(40.0), step(2.5, 180.0), step(8.0), arw=times * 6e-7, vrw=times * 5e-5)
-    assert judge(only(find_segments([data])), LIMITS) == ()
+    assert rejection_reasons(only(find_segments([data])), LIMITS) == ()
 
 
 def test_noise_is_found_in_the_rests(bench: Bench, step: Step) -> None:
@@ -214,7 +214,7 @@ def test_too_little_data_are_refused(bench: Bench, step: Step) -> None:
 
 def test_limits_can_be_others(bench: Bench, step: Step) -> None:
     rotation = only(find_segments([bench(step(20.0), step(1.5, 90.0), step(8.0))]))
-    assert judge(rotation, replace(LIMITS, angle_deg=90.0, rest_before_s=15.0)) == ()
+    assert rejection_reasons(rotation, replace(LIMITS, angle_deg=90.0, rest_before_s=15.0)) == ()
 
 
 @pytest.mark.parametrize("samples", [1, 2, 5, 9])
@@ -229,4 +229,4 @@ def test_a_short_last_block_is_no_motion(bench: Bench, step: Step, samples: int)
 def test_no_error_is_extrapolated_for_what_is_no_turn(bench: Bench, step: Step) -> None:
     found = only(find_segments([bench(step(20.0), step(2.0, 9.0), step(20.0))]))
     assert found.peak_deg_per_s < 10.0
-    assert "peak 8 deg/s: slower than 70" in judge(found, LIMITS)
+    assert "peak 8 deg/s: slower than 70" in rejection_reasons(found, LIMITS)

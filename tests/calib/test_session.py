@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.bench.session import JOURNAL, Document, Session
+from calib.bench.session import JOURNAL, EmbeddedFile, Session
 from calib.bench.verify import verify
 from imudrv.calibration import write_calibration
 from imudrv.errors import InputError
@@ -27,8 +27,8 @@ poses: [{id: z-up, up: +Z, east: +X, turn_deg: 180}, {id: x-up, up: +X, east: +Y
 Accept = Callable[..., None]
 
 
-def document(path: Path) -> Document:
-    return Document(str(path), path.read_text())
+def document(path: Path) -> EmbeddedFile:
+    return EmbeddedFile(str(path), path.read_text())
 
 
 def begin(folder: Path) -> Session:
@@ -382,10 +382,13 @@ def test_another_unit_is_refused(session: Session) -> None:
     ("given", "message"),
     [
         (
-            {"procedure": Document("other.yaml", "another\n")},
+            {"procedure": EmbeddedFile("other.yaml", "another\n")},
             "procedure: expected .*bench.yaml as it was, got other",
         ),
-        ({"site": Document("roof.yaml", "another\n")}, "site: expected .*site.yaml as it was, got roof.yaml"),
+        (
+            {"site": EmbeddedFile("roof.yaml", "another\n")},
+            "site: expected .*site.yaml as it was, got roof.yaml",
+        ),
         ({"profile": "imu50-can"}, "profile: expected imu50-rs422 as it was, got imu50-can"),
     ],
 )

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calib.certificate import arms_of
+from calib.certificate import lever_arms_of
 from calib.cli.main import main as calib
 from calib.detection.noise import Noise
 from calib.lever_arms.gauge import GAUGES, convert
@@ -21,9 +21,9 @@ from calib.reports.text import as_text
 from calib.reports.validation import document
 from calib.validation import simulate as simulation
 from calib.validation.navigate import navigate
-from calib.validation.simulate import Subject, campaign, scenario, subject, trial
-from calib.validation.trial import Setting, Trial
-from calib.validation.verdict import Judged, judge, noise_velocity
+from calib.validation.simulate import SimulatedUnit, campaign, scenario, subject, trial
+from calib.validation.trial import Trial, TrialSettings
+from calib.validation.verdict import TrialMetrics, evaluate, noise_velocity
 from imudrv import Capture, Compensator, coefficients, load_profile, rate_filter, write_calibration
 from imudrv.calibration import Calibration, SensingPoints, SizeEffect
 from imudrv.errors import InputError
@@ -44,7 +44,7 @@ ALIGN_S = 60.0
 
 
 @pytest.fixture(scope="module")
-def who() -> Subject:
+def who() -> SimulatedUnit:
     """A unit with errors, and what the procedure, three half turns, found of its arms."""
     return subject(scenario("rotation").unit, 1)
 
@@ -56,25 +56,27 @@ def short(name: str, after_s: float = 10.0) -> Scenario:
     return made.model_copy(update={"motion": (*motion, Segment(rest=Rest(duration_s=after_s)))})
 
 
-def tried(name: str, who: Subject, **more: object) -> tuple[Trial, Judged]:
+def tried(name: str, who: SimulatedUnit, **more: object) -> tuple[Trial, TrialMetrics]:
     made = trial(name, short(name), who, 1, align_s=ALIGN_S, **more)  # type: ignore[arg-type]
-    return made, judge(made)
+    return made, evaluate(made)
 
 
 @pytest.fixture(scope="module")
-def rotation(who: Subject) -> tuple[Trial, Judged]:
+def rotation(who: SimulatedUnit) -> tuple[Trial, TrialMetrics]:
     return tried("rotation", who)
 
 
-def test_the_unit_differs_from_its_calibration_and_the_arms_are_not_the_true_ones(who: Subject) -> None:
+def test_the_unit_differs_from_its_calibration_and_the_arms_are_not_the_true_ones(who: SimulatedUnit) -> None:
     assert who.found.gyro == NOMINAL.gyro != who.real.gyro
     assert who.found.accelerometer == NOMINAL.accelerometer != who.real.accelerometer
-    error = (who.result.R_b - arms_of(who.real, "real").r_b) / MM
+    error = (who.result.R_b - lever_arms_of(who.real, "real").r_b) / MM
     # math.md 4: 0.02 to 0.05 mm rms; exactly zero would be the truth itself
     assert 1e-4 < np.sqrt((error**2).mean()) < 0.1
 
 
-def test_half_a_turn_leaves_less_than_a_twentieth_of_the_velocity(rotation: tuple[Trial, Judged]) -> None:
+def test_half_a_turn_leaves_less_than_a_twentieth_of_the_velocity(
+    rotation: tuple[Trial, TrialMetrics],
+) -> None:
     made, judged = rotation
     assert judged.expected == "smaller"
     assert judged.first[0] > 100 * MM  # 8.8 / 2.5 m/s a metre, arms of 30 mm
@@ -86,7 +88,7 @@ def test_half_a_turn_leaves_less_than_a_twentieth_of_the_velocity(rotation: tupl
     assert judged.effect[1] < 0.01 * judged.effect[0]
 
 
-def test_fierce_rocking_leaves_less_than_a_twentieth_of_the_velocity(who: Subject) -> None:
+def test_fierce_rocking_leaves_less_than_a_twentieth_of_the_velocity(who: SimulatedUnit) -> None:
     made, judged = tried("rocking", who)
     assert made.peak_deg_per_s > 50.0
     assert judged.first[0] > 500 * MM  # omega^2 r over two minutes
@@ -94,7 +96,7 @@ def test_fierce_rocking_leaves_less_than_a_twentieth_of_the_velocity(who: Subjec
     assert judged.effect[1] < 0.01 * judged.effect[0]
 
 
-def test_vibration_is_not_changed(who: Subject) -> None:
+def test_vibration_is_not_changed(who: SimulatedUnit) -> None:
     made, judged = tried("vibration", who)
     assert made.expected == "same"
     assert judged.change < 0.05 * judged.whole[0]  # the requirement, and the next
@@ -102,11 +104,11 @@ def test_vibration_is_not_changed(who: Subject) -> None:
     assert judged.good
 
 
-def test_rest_is_not_changed(who: Subject) -> None:
+def test_rest_is_not_changed(who: SimulatedUnit) -> None:
     still = scenario("static", ALIGN_S)
     still = still.model_copy(update={"motion": (Segment(rest=Rest(duration_s=ALIGN_S + 120.0)),)})
     made = trial("static", still, who, 1, align_s=ALIGN_S)
-    judged = judge(made)
+    judged = evaluate(made)
     assert made.moved_s is None
     assert made.after.all()
     assert np.isnan(judged.before).all()
@@ -114,14 +116,14 @@ def test_rest_is_not_changed(who: Subject) -> None:
     assert judged.change < judged.noise
 
 
-def test_arms_that_are_wrong_are_found_out(who: Subject, rotation: tuple[Trial, Judged]) -> None:
+def test_arms_that_are_wrong_are_found_out(who: SimulatedUnit, rotation: tuple[Trial, TrialMetrics]) -> None:
     wrong = who.found.model_copy(update={"size_effect": _turned(who)})
     judged = tried("rotation", replace(who, found=wrong))[1]
     assert not judged.good
     assert judged.smaller_by == pytest.approx(-1.0, abs=0.05)  # twice as much as without
 
 
-def _turned(who: Subject) -> SizeEffect:
+def _turned(who: SimulatedUnit) -> SizeEffect:
     """Arms of the wrong sign."""
     effect = who.found.size_effect
     assert effect is not None
@@ -131,17 +133,17 @@ def _turned(who: Subject) -> SizeEffect:
 
 def in_gauge(calibration: Calibration, gauge: str) -> Calibration:
     stated = ("y", [0.011, -0.02, 0.005]) if gauge == "given" else None
-    arms = convert(arms_of(calibration, "found"), gauge, stated)  # type: ignore[arg-type]
+    arms = convert(lever_arms_of(calibration, "found"), gauge, stated)  # type: ignore[arg-type]
     rows = [tuple(r) for r in (arms.r_b / MM).tolist()]
     effect = SizeEffect(r_mm=SensingPoints(x=rows[0], y=rows[1], z=rows[2]), gauge=arms.gauge)
     return calibration.model_copy(update={"size_effect": effect})
 
 
-def test_the_gauge_does_not_matter(who: Subject) -> None:
+def test_the_gauge_does_not_matter(who: SimulatedUnit) -> None:
     pulses = list(_pulses(short("rotation", 3.0).model_copy(update={"seed": 4})))
     site = scenario("rotation").site
     found = [
-        judge(navigate(gauge, pulses, Setting(LAYOUT, in_gauge(who.found, gauge), site, ALIGN_S)))
+        evaluate(navigate(gauge, pulses, TrialSettings(LAYOUT, in_gauge(who.found, gauge), site, ALIGN_S)))
         for gauge in GAUGES
     ]
     for other in found[1:]:
@@ -151,11 +153,11 @@ def test_the_gauge_does_not_matter(who: Subject) -> None:
             )  # the requirement, m/s
 
 
-def test_any_pieces_give_the_same_bits(who: Subject) -> None:
+def test_any_pieces_give_the_same_bits(who: SimulatedUnit) -> None:
     pulses = np.concatenate(list(_pulses(short("rotation", 3.0))))
     site = scenario("rotation").site
     for more in ({}, {"skew_s": 0.4e-3}, {"rate_filter": "dither", "skew_s": -1.3e-3}):
-        setting = replace(Setting(LAYOUT, who.found, site, ALIGN_S), **more)  # type: ignore[arg-type]
+        setting = replace(TrialSettings(LAYOUT, who.found, site, ALIGN_S), **more)  # type: ignore[arg-type]
         whole = navigate("whole", [pulses], setting)
         pieces = navigate("pieces", np.array_split(pulses, 1009), setting)
         np.testing.assert_array_equal(whole.normal.v_n, pieces.normal.v_n)
@@ -173,26 +175,28 @@ def test_a_skew_is_estimated_with_a_rocking_and_put_right() -> None:
     unit = made.unit.model_copy(update={"accelerometer_skew_s": 1e-3})
     made = made.model_copy(update={"unit": unit})
     who = subject(unit, 2, procedure=(*simulation.PROCEDURE, "rocking"))
-    (skew,) = (n for n in who.result.nuisances if n.name == "skew_s")
+    (skew,) = (n for n in who.result.parameters if n.name == "skew_s")
     assert skew.seen
     assert skew.value == pytest.approx(1e-3, abs=3.0 * skew.sigma)
     ignored, right = (
-        judge(trial("rocking", made, who, 2, align_s=ALIGN_S, skew_s=s)) for s in (0.0, who.skew_s)
+        evaluate(trial("rocking", made, who, 2, align_s=ALIGN_S, skew_s=s)) for s in (0.0, who.skew_s)
     )
     # 1 ms is 1 to 2 % of the effect here; what is left of it follows the estimate's error
     assert ignored.effect[1] > 0.008 * ignored.effect[0]
     assert right.effect[1] < 0.5 * ignored.effect[1]
 
 
-def test_raw_dither_hurts_with_the_causal_filter(who: Subject) -> None:
-    assert judge(_raw(who, "causal")).first[1] > 500 * MM  # 2 to 7 mg of false bias, turned over by the turn
+def test_raw_dither_hurts_with_the_causal_filter(who: SimulatedUnit) -> None:
+    assert (
+        evaluate(_raw(who, "causal")).first[1] > 500 * MM
+    )  # 2 to 7 mg of false bias, turned over by the turn
 
 
-def test_raw_dither_does_not_hurt_with_the_dither_filter(who: Subject) -> None:
-    assert judge(_raw(who, "dither")).good
+def test_raw_dither_does_not_hurt_with_the_dither_filter(who: SimulatedUnit) -> None:
+    assert evaluate(_raw(who, "dither")).good
 
 
-def _raw(who: Subject, name: str) -> Trial:
+def _raw(who: SimulatedUnit, name: str) -> Trial:
     made = short("rotation")
     assert made.unit.dither is not None
     dither = made.unit.dither.model_copy(update={"in_increments": 1.0})
@@ -216,9 +220,9 @@ def test_noise_of_velocity_grows_as_random_walks_do_and_swings_with_schuler() ->
     assert noise_velocity(np.array([3600.0]), noise, 9.8)[0] == pytest.approx(v.std(), rel=0.025)
 
 
-def test_a_rest_that_is_too_short_is_told_with_what_to_do(who: Subject) -> None:
+def test_a_rest_that_is_too_short_is_told_with_what_to_do(who: SimulatedUnit) -> None:
     made = short("rotation", 3.0)
-    setting = Setting(LAYOUT, who.found, made.site, ALIGN_S + 8.0)
+    setting = TrialSettings(LAYOUT, who.found, made.site, ALIGN_S + 8.0)
     with pytest.raises(InputError, match=r"run: expected a rest of 73 s at the beginning, .* got 70\.0 s"):
         navigate("run", _pulses(made), setting)
     with pytest.raises(InputError, match=r"expected samples beyond the alignment, got 75\.5 s in all"):
@@ -228,15 +232,15 @@ def test_a_rest_that_is_too_short_is_told_with_what_to_do(who: Subject) -> None:
         navigate("run", _pulses(still_turning), replace(setting, align_s=ALIGN_S))
 
 
-def test_a_skew_is_not_put_right_over_a_gap(who: Subject) -> None:
+def test_a_skew_is_not_put_right_over_a_gap(who: SimulatedUnit) -> None:
     pulses = np.concatenate(list(_pulses(short("rotation", 3.0))))
     pulses["flags"][30_000] |= Flag.MISSING_BEFORE
-    setting = Setting(LAYOUT, who.found, scenario("rotation").site, ALIGN_S, skew_s=1e-3)
+    setting = TrialSettings(LAYOUT, who.found, scenario("rotation").site, ALIGN_S, skew_s=1e-3)
     with pytest.raises(InputError, match="skew: expected samples without gaps"):
         navigate("run", [pulses], setting)
 
 
-def test_a_campaign_gives_each_unit_its_trials(monkeypatch: pytest.MonkeyPatch, who: Subject) -> None:
+def test_a_campaign_gives_each_unit_its_trials(monkeypatch: pytest.MonkeyPatch, who: SimulatedUnit) -> None:
     monkeypatch.setattr(simulation, "subject", lambda unit, seed: who)
     monkeypatch.setattr(simulation, "scenario", partial(short, after_s=3.0))
     monkeypatch.setattr(simulation, "trial", partial(trial, align_s=ALIGN_S))
@@ -247,7 +251,7 @@ def test_a_campaign_gives_each_unit_its_trials(monkeypatch: pytest.MonkeyPatch, 
     assert (made[0].normal.v_n != made[1].normal.v_n).any()
 
 
-def test_the_report_tells_verdict_figures_and_both_courses(rotation: tuple[Trial, Judged]) -> None:
+def test_the_report_tells_verdict_figures_and_both_courses(rotation: tuple[Trial, TrialMetrics]) -> None:
     made, judged = rotation
     bad = replace(made, name="<b>slow</b>\x1b[31m"), replace(judged, first=(0.1, 0.2, np.nan))
     told = document("unit <7>", [rotation, bad], drawn=1)
@@ -264,7 +268,7 @@ def test_the_report_tells_verdict_figures_and_both_courses(rotation: tuple[Trial
 
 
 def test_a_recorded_run_is_judged_by_the_command(
-    who: Subject, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    who: SimulatedUnit, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     made = short("rotation", 3.0)
     made = made.model_copy(update={"unit": made.unit.model_copy(update={"calibration": who.real})})

@@ -26,7 +26,7 @@ from imudrv.files import settings_file
 from imudrv.records import Records
 from imudrv.sim import links
 from imudrv.sim.capture import wire
-from imudrv.sim.live import MOST, Pace, Playback, Played, play, speed_of
+from imudrv.sim.live import MOST, Pace, PacedPlayback, Played, play, speed_of
 from imudrv.sim.scenario import Scenario
 
 Make = Callable[..., Scenario]
@@ -448,7 +448,7 @@ def test_a_signal_ends_a_process_cleanly(number: signal.Signals, tmp_path: Path)
 
 def test_playback_gives_what_is_due_and_no_more(run: Scenario) -> None:
     layout = RS422.layout()
-    playback = Playback(run, layout)
+    playback = PacedPlayback(run, layout)
     assert playback.due_ns() == 1_000_000
     assert playback.due_ns(group=10) == 10_000_000
     assert playback.take(999_999) is None

@@ -7,7 +7,7 @@ import pytest
 from imudrv.errors import InputError
 from imudrv.nav.earth import earth_rate_n
 from imudrv.sim.scenario import NOMINAL, Scenario
-from imudrv.sim.unit import STATUS_OVERFLOW, STATUS_WARM_UP, Chunk, TrueUnit, draw, simulate
+from imudrv.sim.unit import STATUS_OVERFLOW, STATUS_WARM_UP, Chunk, TrueUnit, draw_true_unit, simulate
 from imudrv.units import ARCSEC, DEG, DEG_PER_H, DEG_PER_SQRT_H, PPM, UG, URAD
 
 Make = Callable[..., Scenario]
@@ -84,7 +84,7 @@ def test_pulses_taken_back_by_the_calibration_are_the_truth(scenario: Make) -> N
             start={"pivot_offset_mm": [40, 30, 20]},
         )
     )
-    unit = draw(scenario(REST, unit={"calibration": FINE}))
+    unit = draw_true_unit(scenario(REST, unit={"calibration": FINE}))
     tau, warmer = 1e-3, got.pulses["temperature_degc"][:, :1] - 35.0
     k_g = np.array([0.001, 0.002, 0.0015]) * ARCSEC * (1 + warmer * np.array([10, -20, 30]) * PPM)
     b_g = (np.array([10, -20, 30]) + warmer * np.array([1, 2, -1])) * DEG_PER_H
@@ -102,7 +102,7 @@ def test_pulses_taken_back_by_the_calibration_are_the_truth(scenario: Make) -> N
 
 def test_the_fraction_of_a_pulse_is_never_lost(scenario: Make) -> None:
     coarse = scenario(REST, TURN, REST)
-    got, unit = run(coarse), draw(coarse)
+    got, unit = run(coarse), draw_true_unit(coarse)
     total = np.cumsum(got.pulses["gyro"], axis=0)
     exact = np.cumsum(got.truth["dtheta_b"] / unit.gyro_scale, axis=0)
     assert (
@@ -141,7 +141,7 @@ def test_any_chunk_gives_the_same_bits(scenario: Make) -> None:
 def test_noise_is_a_random_walk_of_the_stated_size(scenario: Make) -> None:
     noise = {"arw_deg_per_sqrt_h": 0.3, "vrw_m_s_per_sqrt_h": 0.6}
     noisy = scenario({"rest": {"duration_s": 100.0}}, unit={"calibration": FINE, "noise": noise})
-    pulses, unit = run(noisy).pulses, draw(noisy)
+    pulses, unit = run(noisy).pulses, draw_true_unit(noisy)
     gyro = pulses["gyro"] * unit.gyro_scale
     speed = pulses["accelerometer"] / unit.accelerometer_scale
     for samples in (1, 100):
@@ -165,7 +165,7 @@ def test_dither_of_the_case_rectifies_to_minus_half_its_rate_squared(scenario: M
         {"rest": {"duration_s": 1.0}}, unit={"calibration": {**FINE, "temperature": None}, "dither": dither}
     )
     still = scenario({"rest": {"duration_s": 1.0}}, unit={"calibration": {**FINE, "temperature": None}})
-    unit = draw(still)
+    unit = draw_true_unit(still)
     change = (run(shaking).pulses["accelerometer"] - run(still).pulses["accelerometer"]).sum(
         axis=0
     ) / unit.accelerometer_scale
@@ -275,8 +275,8 @@ def test_residuals_have_their_sigma_and_nothing_else_changes(scenario: Make) -> 
         "accelerometer_scale_ppm": 20.0,
         "accelerometer_misalignment_urad": 40.0,
     }
-    units = [draw(scenario(REST, seed=seed, unit={"residuals": sigmas})) for seed in range(200)]
-    exact = draw(scenario(REST))
+    units = [draw_true_unit(scenario(REST, seed=seed, unit={"residuals": sigmas})) for seed in range(200)]
+    exact = draw_true_unit(scenario(REST))
 
     def sigma(of: Callable[[TrueUnit], Any]) -> float:
         return float(np.std([of(u) - of(exact) for u in units]))
@@ -296,7 +296,7 @@ def test_residuals_have_their_sigma_and_nothing_else_changes(scenario: Make) -> 
 
 
 def test_without_a_calibration_the_unit_is_the_nominal_one(scenario: Make) -> None:
-    unit = draw(scenario(REST))
+    unit = draw_true_unit(scenario(REST))
     assert NOMINAL.size_effect is not None
     np.testing.assert_array_equal(unit.r_b, NOMINAL.size_effect.r_m)
     np.testing.assert_array_equal(unit.gyro_scale, np.full(3, 0.5 * ARCSEC))

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from imudrv.files import spool
-from imudrv.files.spool import Piece, Spool
+from imudrv.files.spool import AppendThread, Piece
 
 
 def test_a_round_ends_with_what_had_waited_though_more_comes_meanwhile(
@@ -11,7 +11,7 @@ def test_a_round_ends_with_what_had_waited_though_more_comes_meanwhile(
 ) -> None:
     monkeypatch.setattr(spool, "PERIOD_S", 3600)  # so that the round at the end is the only one
     pieces = [Piece(b"a", 1, True), Piece(b"b", 2, True), Piece(b"c", 3, False), Piece(b"d", 4, False)]
-    writer = Spool(tmp_path / "file", b"head", lambda: pieces.pop(0), lambda: b"end")
+    writer = AppendThread(tmp_path / "file", b"head", lambda: pieces.pop(0), lambda: b"end")
     writer.close()
     assert (tmp_path / "file").read_bytes() == b"headabcend"
     assert writer.sent == 6
