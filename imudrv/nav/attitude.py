@@ -13,11 +13,9 @@ from numpy.typing import ArrayLike
 
 from imudrv.arrays import Array
 from imudrv.kernels import kernel
-from imudrv.vectors import Vector, add, cross, dot, scale
+from imudrv.vectors import Matrix, Vector, add, cross, dot, scale
 
 Quaternion: TypeAlias = tuple[float, float, float, float]
-Matrix: TypeAlias = tuple[Vector, Vector, Vector]
-"""By rows."""
 
 
 @kernel
