@@ -57,7 +57,6 @@ from imudrv.arrays import Array
 from imudrv.errors import InputError
 from imudrv.kernels import kernel
 from imudrv.nav.attitude import (
-    Matrix,
     Quaternion,
     conjugate,
     product,
@@ -71,7 +70,7 @@ from imudrv.nav.attitude import (
 from imudrv.nav.earth import SEMI_MAJOR_AXIS, earth_rate_n, normal_gravity, radii
 from imudrv.records import Records
 from imudrv.units import NS
-from imudrv.vectors import Vector, add, cross, dot, put, scale, subtract, vector_at
+from imudrv.vectors import Matrix, Vector, add, cross, dot, put, scale, subtract, vector_at
 
 _NAVIGATION: Final = [
     ("counter", np.int64),

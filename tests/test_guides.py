@@ -1,0 +1,90 @@
+"""The commands of README and guides work when pasted in their order.
+
+A fenced block names what the test does with it: ``sh`` is pasted, ``sh live`` runs until the guide ends,
+``sh status`` is repeated until samples flow, ``sh hardware`` needs a unit and ``sh long`` minutes (neither is
+run), ``yaml NAME`` is written to a file.
+"""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import pytest
+
+TOP = Path(__file__).resolve().parents[1]
+GUIDES = sorted((TOP / "tools" / "guides").glob("*.md"))
+BLOCK = re.compile(r"^```(\w+)(?: ([\w.-]+))?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+DEADLINE_S = 240.0
+FLOWING = (0, 3)
+"""Exit codes of `imudrv status` while samples flow: ok, and warning."""
+KINDS = {("sh", ""), ("sh", "live"), ("sh", "status"), ("sh", "hardware"), ("sh", "long"), ("python", "")}
+
+
+@pytest.fixture
+def shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder in which ``tools/run`` runs what follows it, without an installation."""
+    run = tmp_path / "tools" / "run"
+    run.parent.mkdir()
+    run.write_text('#!/bin/sh\nexec "$@"\n')
+    run.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}:{os.environ['PATH']}")
+    monkeypatch.setenv("PYTHONPATH", str(TOP))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    return tmp_path
+
+
+@contextmanager
+def running(text: str, folder: Path) -> Iterator[None]:
+    """Run a block until the end."""
+    process = subprocess.Popen(["bash", "-c", f"exec {text}"], cwd=folder, start_new_session=True)
+    try:
+        yield
+        assert process.poll() is None, f"ended early: {text}"
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGINT)
+        process.wait(DEADLINE_S)
+
+
+def pasted(text: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    command = ["bash", "-e", "-o", "pipefail", "-c", text]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=DEADLINE_S)
+
+
+@pytest.mark.parametrize("guide", GUIDES, ids=lambda guide: guide.stem)
+def test_the_commands_of_a_guide_work_in_their_order(guide: Path, shell: Path) -> None:
+    with ExitStack() as live:
+        for language, kind, text in BLOCK.findall(guide.read_text()):
+            if language == "yaml" and kind:
+                (shell / kind).write_text(text)
+            elif (language, kind) == ("sh", "live"):
+                live.enter_context(running(text, shell))
+            elif (language, kind) == ("sh", "status"):
+                end = time.monotonic() + DEADLINE_S
+                while pasted(text, shell).returncode not in FLOWING:
+                    assert time.monotonic() < end, f"waited in vain: {text}"
+            elif (language, kind) == ("sh", ""):
+                done = pasted(text, shell)
+                assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("guide", GUIDES, ids=lambda guide: guide.stem)
+def test_each_block_of_a_guide_says_what_to_do_with_it(guide: Path) -> None:
+    for language, kind, _ in BLOCK.findall(guide.read_text()):
+        assert (language, kind) in KINDS or language == "yaml", f"{language} {kind}"
+
+
+def test_the_readme_is_short_and_its_links_lead_somewhere() -> None:
+    readme = (TOP / "README.md").read_text()
+    assert len(readme) < 5500
+    for link in re.findall(r"\]\(([^)]+)\)", readme):
+        assert (TOP / link).exists(), link
+    assert {f"tools/guides/{guide.name}" for guide in GUIDES} == set(
+        re.findall(r"tools/guides/\w+\.md", readme)
+    )
