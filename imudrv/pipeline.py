@@ -70,17 +70,17 @@ class Pipeline:
         -------
         Sampled
         """
-        return self._through(self.decoder.feed(data, t_ns))
+        return self._process(self.decoder.feed(data, t_ns))
 
     def close(self) -> PipelineOutput:
         """End of the line: what was held back comes out."""
-        pulses, increments = self._through(self.decoder.close())
+        pulses, increments = self._process(self.decoder.close())
         rest = self._compensator.close()
         if self._repeats:
-            rest = self._unrepeated(rest)
+            rest = self._drop_overlap(rest)
         return PipelineOutput(pulses, np.concatenate([increments, self.clock.stamp(rest)]))
 
-    def exchange(self, coefficients: Coefficients) -> None:
+    def replace_calibration(self, coefficients: Coefficients) -> None:
         """Go over to another calibration between two samples.
 
         The new one is first fed beside the old one until it knows the rates, so that no sample misses its
@@ -95,11 +95,11 @@ class Pipeline:
         self._repeats = True
 
     @property
-    def exchanging(self) -> bool:
+    def replacing(self) -> bool:
         """Whether a new calibration is still on its way in."""
         return self._next is not None
 
-    def _through(self, frames: Records) -> PipelineOutput:
+    def _process(self, frames: Records) -> PipelineOutput:
         if not len(frames):
             return _NOTHING
         pulses = self.tracker.feed(frames)
@@ -108,12 +108,12 @@ class Pipeline:
         self.clock.feed(pulses)
         increments = self._compensator.feed(pulses)
         if self._next is not None:
-            increments = self._exchanged(self._next, pulses, increments)
+            increments = self._switched(self._next, pulses, increments)
         if self._repeats:
-            increments = self._unrepeated(increments)
+            increments = self._drop_overlap(increments)
         return PipelineOutput(pulses, self.clock.stamp(increments))
 
-    def _exchanged(self, new: Compensator, pulses: Records, old: Records) -> Records:
+    def _switched(self, new: Compensator, pulses: Records, old: Records) -> Records:
         """Increments of the old calibration up to where the new one knows its rates, then of the new one."""
         fresh = new.feed(pulses)
         if new.has_size_effect:
@@ -128,7 +128,7 @@ class Pipeline:
         self._compensator, self._next = new, None
         return np.concatenate([old[old["t_ns"] < since], fresh[fresh["t_ns"] >= since]])
 
-    def _unrepeated(self, increments: Records) -> Records:
+    def _drop_overlap(self, increments: Records) -> Records:
         """Leave out what was handed on: after an exchange, one that lags more gives some samples again."""
         fresh = increments[increments["t_ns"] > self._last_ns]
         if len(fresh):

@@ -25,7 +25,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from imudrv.calibration import write_calibration
 from imudrv.errors import InputError
-from imudrv.hostclock import now_ns
 from imudrv.profiles import load
 from imudrv.receive import receive
 from imudrv.recording.reader import Recording
@@ -107,7 +106,7 @@ class Unit:
                 time.sleep(0.001)
 
     def skip(self, count: int) -> None:
-        """Numbers that the unit counts while nobody hears."""
+        """Advance the unit's counter without sending."""
         self.counter += count
 
 
@@ -126,7 +125,6 @@ class Service:
             stderr=subprocess.PIPE,
             text=True,
         )
-        self.said: list[str] = []
         self.said: list[str] = []
         self.warned: list[str] = []
         self._listeners = [
@@ -265,13 +263,15 @@ def test_every_sample_comes_out_in_order_and_as_the_offline_command_makes_it(fol
         np.testing.assert_array_equal(recorded[name], live[name], err_msg=name)
 
 
-def test_an_unplug_is_told_and_after_the_replug_the_stream_goes_on_with_the_gap_flagged(folder: Path) -> None:
+def test_an_unplug_is_reported_and_after_the_replug_the_stream_continues_with_the_gap_flagged(
+    folder: Path,
+) -> None:
     unit = Unit(folder / "unit")
     with serving(folder, *serial(folder), "--record", "run.mcap") as service:
         unit.send(300)
         until(lambda: service.good() == 300, "the first 300 samples")
         unit.unplug()
-        until(lambda: service.heard("port lost"), "the loss told")
+        until(lambda: service.heard("port lost"), "the loss reported")
         until(lambda: service.status()["health"] == "fail", "the loss in the status")
         unit.skip(50)
         unit.plug()
@@ -288,12 +288,12 @@ def test_an_unplug_is_told_and_after_the_replug_the_stream_goes_on_with_the_gap_
     assert increments["counter"][flagged].tolist() == [350]
 
 
-def test_silence_is_told_and_nothing_exits(folder: Path) -> None:
+def test_silence_is_reported_and_nothing_exits(folder: Path) -> None:
     unit = Unit(folder / "unit")
     with serving(folder, *serial(folder)) as service:
-        until(lambda: service.heard("silent"), "silence told")
+        until(lambda: service.heard("silent"), "silence reported")
         unit.send(100)
-        until(lambda: service.heard("the unit is back"), "the unit heard again")
+        until(lambda: service.heard("the unit is back"), "the unit received again")
         until(lambda: service.good() == 100, "its samples")
         assert service.stop(signal.SIGINT) == 0
         assert service.heard("100 good")
@@ -310,13 +310,13 @@ def test_bytes_without_a_frame_are_a_failure_until_frames_come_again(folder: Pat
         with repeating(lambda: unit.write(garbage)):
             until(lambda: service.status()["health"] == "fail", "the failure in the status")
             until(lambda: service.status()["port"]["state"] == "unreadable", "what has failed")
-            told = service.command("status")
-            assert told.returncode == 4
+            answer = service.command("status")
+            assert answer.returncode == 4
             found = re.match(
                 r"fail\nport unreadable: (\d+) bytes in \d+\.\d s, and no frame of imu50-rs422 in them",
-                told.stdout,
+                answer.stdout,
             )
-            assert found, told.stdout
+            assert found, answer.stdout
             assert int(found[1]) >= len(garbage)
             assert "unreadable" in service.command("monitor").stdout
             assert any(found[0].removeprefix("fail\n") in line for line in service.warned)
@@ -348,7 +348,7 @@ def test_a_unit_at_another_rate_than_its_profile_is_reported_with_both_rates(fol
         assert service.stop() == 0
 
 
-def test_a_simulated_unit_at_another_speed_is_not_said_to_be_at_a_wrong_rate(folder: Path) -> None:
+def test_the_rate_of_a_simulated_unit_at_another_speed_is_not_checked(folder: Path) -> None:
     arguments = ["--port", "sim://static?speed=10", *serial(folder)[2:]]
     with serving(folder, *arguments) as service:
         until(lambda: service.good() > 60_000, "six seconds' samples")  # a rate is judged after four
@@ -356,7 +356,7 @@ def test_a_simulated_unit_at_another_speed_is_not_said_to_be_at_a_wrong_rate(fol
         assert service.stop() == 0
 
 
-def test_a_calibration_is_exchanged_while_running_and_a_bad_one_is_refused(folder: Path) -> None:
+def test_a_calibration_is_replaced_while_running_and_a_bad_one_is_refused(folder: Path) -> None:
     unit = Unit(folder / "unit")
     with serving(folder, *serial(folder), "--record", "run.mcap") as service:
         unit.send(200)
@@ -422,10 +422,10 @@ def test_constants_and_sha256_agree_however_the_calibration_file_is_replaced(
             scale = service.status()["last"]["dtheta_b"][0] / angle
             assert scale / ARCSEC == pytest.approx({"a": 0.5, "b": 1.0}[units[left]], rel=1e-9)  # rounding
         assert service.stop() == 0
-    exchanged = [t.split()[-1] for _, t in Recording(folder / "run.mcap").events() if "exchanged" in t]
+    replaced = [t.split()[-1] for _, t in Recording(folder / "run.mcap").events() if "replaced" in t]
     attached = [c.serial_number for _, c in Recording(folder / "run.mcap").calibrations()]
     short = {digest[:12]: name for digest, name in units.items()}
-    assert attached == ["a", *(short[digest] for digest in exchanged)]
+    assert attached == ["a", *(short[digest] for digest in replaced)]
 
 
 def test_at_the_start_constants_and_sha256_agree_too(
@@ -442,10 +442,9 @@ def test_at_the_start_constants_and_sha256_agree_too(
     with replaced_at_random(folder / "unit.yaml", list(contents.values()), seed=11):
         for _ in range(40):
             service = Driver(settings, lambda _: None)
-            status = service.status(now_ns())
-            service.stop()
-            service.run()
-            assert status["unit"] == units[status["calibration"]["sha256"]]
+            status = service.status
+            service.close()
+            assert status.unit == units[status.calibration.sha256]
 
 
 def test_a_reader_of_its_text_that_leaves_costs_the_text_alone(folder: Path) -> None:
@@ -527,7 +526,7 @@ def test_a_sighup_while_it_starts_does_not_end_it(folder: Path) -> None:
         assert service.stop() == 0
 
 
-def test_it_ends_when_its_terminal_has_gone_and_not_as_if_somebody_had_asked(folder: Path) -> None:
+def test_it_ends_with_another_exit_code_when_its_terminal_has_gone(folder: Path) -> None:
     unit = Unit(folder / "unit")
     master, slave = pty.openpty()
     with serving(folder, *serial(folder), stdin=slave) as service:
@@ -615,7 +614,7 @@ def test_a_status_for_scripts_and_one_for_people(folder: Path) -> None:
     assert "expected a running service" in gone.stderr
 
 
-def test_the_service_manager_is_told(folder: Path) -> None:
+def test_the_service_manager_is_notified(folder: Path) -> None:
     unit = Unit(folder / "unit")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(folder / "notify"))
