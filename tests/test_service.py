@@ -504,7 +504,7 @@ def test_a_stopped_terminal_holds_its_text_alone(folder: Path) -> None:
             until(lambda: service.status()["port"]["state"] == "lost", "the loss")
             unit.plug()
             until(lambda n=reconnects: service.status()["port"]["reconnects"] == n, "the port again")
-        until(lambda: "stdout: takes no text" in service.notices(), "a warning")
+        until(lambda: "stdout: accepts no text" in service.notices(), "a warning")
         assert counters == list(range(300))
         termios.tcflow(slave, termios.TCOON)
         until(lambda: printed(b"port is back", 3), "what was held back")

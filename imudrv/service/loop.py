@@ -149,13 +149,13 @@ class Service:
         with self._signals.caught(SIGTERM, SIGINT, SIGHUP), frozen_gc():
             try:
                 self._publish_status(self._clock())
-                self._manager.tell("READY=1")
+                self._manager.notify("READY=1")
                 sha256 = self._calibration.current.sha256
                 self._events.event(f"serving {self._settings.port}, calibration {sha256[:12]}")
                 while not self._signals.stop and self.step():
                     pass
             finally:
-                self._manager.tell("STOPPING=1")
+                self._manager.notify("STOPPING=1")
                 self.close()
 
     def step(self) -> bool:
@@ -249,7 +249,7 @@ class Service:
             sink.poll()
         self._recordings.poll()
         self._port.check_line(now)
-        self._manager.alive(now)
+        self._manager.feed_watchdog(now)
         if self._events.is_new or now - self._rated_ns >= NS_PER_S:
             self._check_calibration(now)
             self._publish_status(now)
