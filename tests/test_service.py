@@ -136,7 +136,7 @@ class Service:
             listener.start()
         if self.process.stdout is not None:
             until(lambda: self.said or self.process.poll() is not None, "the first line")
-            assert self.heard("serving"), self.said + self.warned
+            assert self.logged("serving"), self.said + self.warned
 
     def status(self) -> dict[str, Any]:
         return ask(self.socket)
@@ -154,7 +154,7 @@ class Service:
         except InputError:
             return False
 
-    def heard(self, words: str) -> bool:
+    def logged(self, words: str) -> bool:
         return any(words in line for line in [*self.said, *self.warned])
 
     def command(self, *arguments: str) -> subprocess.CompletedProcess[str]:
@@ -271,11 +271,11 @@ def test_an_unplug_is_reported_and_after_the_replug_the_stream_continues_with_th
         unit.send(300)
         until(lambda: service.good() == 300, "the first 300 samples")
         unit.unplug()
-        until(lambda: service.heard("port lost"), "the loss reported")
+        until(lambda: service.logged("port lost"), "the loss reported")
         until(lambda: service.status()["health"] == "fail", "the loss in the status")
         unit.skip(50)
         unit.plug()
-        until(lambda: service.heard("port is back"), "the port again")
+        until(lambda: service.logged("port is back"), "the port again")
         unit.send(300)
         until(lambda: service.good() == 600, "the other 300 samples")
         status = service.status()
@@ -291,12 +291,12 @@ def test_an_unplug_is_reported_and_after_the_replug_the_stream_continues_with_th
 def test_silence_is_reported_and_nothing_exits(folder: Path) -> None:
     unit = Unit(folder / "unit")
     with serving(folder, *serial(folder)) as service:
-        until(lambda: service.heard("silent"), "silence reported")
+        until(lambda: service.logged("silent"), "silence reported")
         unit.send(100)
-        until(lambda: service.heard("the unit is back"), "the unit received again")
+        until(lambda: service.logged("the unit is back"), "the unit received again")
         until(lambda: service.good() == 100, "its samples")
         assert service.stop(signal.SIGINT) == 0
-        assert service.heard("100 good")
+        assert service.logged("100 good")
     assert not service.socket.exists()
 
 
@@ -338,7 +338,7 @@ def test_a_unit_at_another_rate_than_its_profile_is_reported_with_both_rates(fol
     text = (resources.files("imudrv.profiles") / "imu50-rs422.yaml").read_text("utf-8")
     (folder / "slow.yaml").write_text(text.replace("sample_rate_hz: 1000", "sample_rate_hz: 200"))
     with simulated(folder, "slow.yaml"), serving(folder, *serial(folder)) as service:
-        until(lambda: service.heard("the unit counts"), "the rate")
+        until(lambda: service.logged("the unit counts"), "the rate")
         until(lambda: service.status()["port"]["trouble"], "the rate in the status")
         status = service.status()
         assert status["health"] == "warn"
@@ -535,7 +535,7 @@ def test_it_ends_with_another_exit_code_when_its_terminal_has_gone(folder: Path)
         until(lambda: service.good() == 100, "the samples")
         os.close(master)
         assert service.stop(signal.SIGHUP) == INTERRUPTED
-        assert service.heard("100 good")
+        assert service.logged("100 good")
 
 
 def test_a_calibration_of_another_unit_is_refused_at_the_start(folder: Path) -> None:
@@ -639,7 +639,7 @@ def test_a_replay_of_a_capture_gives_what_the_offline_command_gives(folder: Path
     arguments = ["--port", "replay://run.raw?speed=max", *serial(folder)[2:], "--out", "file:live.i50n"]
     with serving(folder, *arguments) as service:
         assert service.ended() == 0
-        assert service.heard("2999 samples by the counter = 2999 good")
+        assert service.logged("2999 samples by the counter = 2999 good")
     command = [sys.executable, "-m", "imudrv", "compensate", "run.raw", *map(str, serial(folder)[2:])]
     subprocess.run([*command, "-o", "offline.i50n"], cwd=folder, check=True, timeout=300, capture_output=True)
     live, offline = (np.fromfile(folder / f"{n}.i50n", "u1").reshape(-1, 76) for n in ("live", "offline"))
