@@ -1,7 +1,7 @@
-"""What the data of a line says about it, without I/O.
+"""Diagnosis of a line by the data that it delivers, without I/O.
 
-Of a stretch: whether a profile fits, how well, and which would fit better. While it flows: whether anything
-comes, whether samples come of it, and at what rate.
+For a piece of data: whether a profile fits, how well, and which would fit better. For a stream: whether data
+arrives, whether it contains samples, and at what rate.
 """
 
 from collections import deque
@@ -18,13 +18,13 @@ from imudrv.units import NS, NS_PER_S
 from imudrv.wire.decoder import FrameDecoder
 
 FEW: Final = 3
-"""Good frames by chance are fewer than this."""
+"""A profile fits from this number of good frames; noise gives fewer."""
 SILENCE_NS: Final = 4 * NS_PER_S // 10
-"""A line that brings nothing for this long, and two samples more, is silent."""
+"""A line without data for this long, plus two samples, is silent."""
 UNREADABLE_NS: Final = NS_PER_S
-"""Data that gives no sample for this long, and as long as samples may be held back, is not the profile's."""
+"""Data without a sample for this long, plus the longest hold-back of samples, does not fit."""
 RATE_TOLERANCE: Final = 0.09
-"""Largest relative error of a right rate: a stall of 250 ms changes one measured over 3 s by less."""
+"""Largest relative error of a correct rate: a stall of 250 ms changes a rate over 3 s by less."""
 _RATE_SECONDS: Final = 3
 _IDLE_BITS: Final = 3
 _STUFFING: Final = 1.2
@@ -32,24 +32,24 @@ _STUFFING: Final = 1.2
 
 @dataclass(frozen=True)
 class TrafficSummary:
-    """What arrived, as a profile reads it; it begins with the first good frame, if there is one.
+    """Summary of data decoded with a profile, from the first good frame on if there is one.
 
     Parameters
     ----------
     amount : int
-        Bytes or messages, of all.
+        Number of bytes or messages in all.
     syncs : int
-        How often the bytes came that a frame begins with; on CAN messages with the profile's identifiers.
+        Number of sync patterns; on CAN of messages with the profile's identifiers.
     counts : SampleCounts
-        Where the samples went.
+        Sample counts.
     rejected : dict of Reason to int
-        Number of runs that are no frame.
+        Number of rejected runs by reason.
     messages : dict of int to int
-        On CAN how many of each identifier of the profile.
+        On CAN the number of messages for each identifier of the profile.
     set_bits : tuple of str
         Names of the status bits that were set at any time.
     degc : dict of str to float
-        The last temperatures, NaN where none came.
+        Latest temperatures; NaN if none was received.
     """
 
     amount: int
@@ -62,40 +62,40 @@ class TrafficSummary:
 
     @property
     def fits(self) -> bool:
-        """The profile is that of the data."""
+        """Whether the data fits the profile."""
         return self.counts.frames >= FEW
 
     @property
     def is_clean(self) -> bool:
-        """Less than one sample in a hundred was lost or came twice."""
-        spoilt = self.counts.lost + self.counts.duplicate
-        return spoilt * 100 < self.counts.expected
+        """Whether less than one sample in a hundred was lost or came twice."""
+        faulty = self.counts.lost + self.counts.duplicate
+        return faulty * 100 < self.counts.expected
 
 
 def decode_traffic(profile: Profile, data: bytes | Records) -> TrafficSummary:
-    """Read data as a profile says.
+    """Decode data with a profile.
 
     Parameters
     ----------
     profile : Profile
-        Of a serial unit for bytes, of a CAN unit for messages.
+        A serial profile for bytes, a CAN profile for messages.
     data : bytes or ndarray of MESSAGE
-        A stretch of what arrived, beginning anywhere.
+        Piece of received data; it may begin anywhere.
 
     Returns
     -------
-    Heard
+    TrafficSummary
     """
     layout = profile.layout()
     decoder = FrameDecoder(layout)
     frames = decoder.feed(data)
     if isinstance(data, bytes) and frames.size:
-        # what lies before is the end of a frame that had begun earlier
+        # the bytes before are the end of a frame that began earlier
         decoder = FrameDecoder(layout)
         frames = decoder.feed(data[frames["offset"][0] :])
     rejected = {reason: entry.runs for reason, entry in decoder.rejected.items()}
     if layout.can:
-        frames = np.concatenate([frames, decoder.close()])  # held until their full counter comes
+        frames = np.concatenate([frames, decoder.close()])  # held until their full counter arrives
     tracker = SequenceTracker(layout)
     pulses = tracker.feed(frames)
     status = int(np.bitwise_or.reduce(pulses["status"])) if pulses.size else 0
@@ -118,27 +118,27 @@ def decode_traffic(profile: Profile, data: bytes | Records) -> TrafficSummary:
 
 
 def best_profile(candidates: Iterable[Profile], data: bytes | Records) -> Profile | None:
-    """The profile that reads most of the data.
+    """Return the profile that decodes most of the data.
 
     Parameters
     ----------
     candidates : iterable of Profile
-        Those of the other transport are left out.
+        Profiles of the other transport are ignored.
     data : bytes or ndarray of MESSAGE
-        A stretch of what arrived.
+        Piece of received data.
 
     Returns
     -------
     Profile or None
-        None where none fits.
+        None if none fits.
     """
     transport = "serial" if isinstance(data, bytes) else "can"
     found: tuple[int, Profile] | None = None
     for profile in candidates:
-        if profile.transport == transport and (heard := decode_traffic(profile, data)).fits:
-            read = heard.counts.frames * sum(m.length for m in profile.messages if m.every == 1)
-            if found is None or read > found[0]:
-                found = read, profile
+        if profile.transport == transport and (traffic := decode_traffic(profile, data)).fits:
+            decoded = traffic.counts.frames * sum(m.length for m in profile.messages if m.every == 1)
+            if found is None or decoded > found[0]:
+                found = decoded, profile
     return found[1] if found else None
 
 
@@ -150,32 +150,32 @@ class LineState(NamedTuple):
     name : str
         ``connecting``, ``streaming``, ``silent``, ``unreadable``, ``lost`` or ``ended``.
     trouble : str
-        What is wrong and what to do; empty if nothing is.
+        What is wrong and what to do; empty if nothing.
     """
 
     name: str
     trouble: str = ""
 
     def __str__(self) -> str:
-        """One line for people."""
+        """One line of text."""
         return self.trouble if self.name == "streaming" else f"port {self.name}: {self.trouble}"
 
 
 class LineWatch:
-    """Judges an open line by what it brings; all times are of one monotonic clock, ns.
+    """Judges an open line by the data that it delivers; all times from one monotonic clock, ns.
 
-    A silent or unreadable line is streaming again with its next sample, not with its next byte. A wrong rate
+    A silent or unreadable line is streaming again with the next sample, not with the next byte. A wrong rate
     is reported after three seconds that all deviate in the same direction, and withdrawn after three that
-    are all right: a stall, a burst of old frames or a leap of the counter changes neither.
+    are all right: a stall, a burst of old frames or a jump of the counter changes neither.
 
     Parameters
     ----------
     profile : Profile
-        What the unit should send.
+        Expected profile.
     in_real_time : bool
-        Whether the unit sends at its own pace; otherwise its rate is not judged.
+        Whether the unit sends at its own pace; otherwise its rate is not checked.
     t_ns : int
-        When the line was opened.
+        Time of opening the line.
     """
 
     def __init__(self, profile: Profile, in_real_time: bool, t_ns: int) -> None:
@@ -187,7 +187,7 @@ class LineWatch:
         self._unreadable_ns = UNREADABLE_NS + held * interval_ns
         self._state = LineState("streaming")
         self._arrived_ns = t_ns
-        self._undecoded = 0  # bytes or messages since the last sample; the first of them came at:
+        self._undecoded = 0  # bytes or messages since the last sample; arrival of the first of them:
         self._undecoded_ns = t_ns
         self._counted: tuple[int, int] | None = None
         self._rates: deque[float] = deque(maxlen=_RATE_SECONDS)
@@ -198,11 +198,11 @@ class LineWatch:
         Parameters
         ----------
         amount : int
-            Bytes or messages; more than none.
+            Number of bytes or messages; at least one.
         samples : int
-            Samples that they completed.
+            Number of samples that they completed.
         t_ns : int
-            Time now.
+            Present time.
         """
         self._arrived_ns = t_ns
         if samples:
@@ -215,14 +215,14 @@ class LineWatch:
         self._undecoded += amount
 
     def counted(self, expected: int, t_ns: int) -> None:
-        """Judge the rate; call it about once a second.
+        """Check the rate; call it about once a second.
 
         Parameters
         ----------
         expected : int
-            Samples by the unit's counter, see `imudrv.imu.sequence.SampleCounts`.
+            Number of samples by the unit's counter, see `imudrv.imu.sequence.SampleCounts`.
         t_ns : int
-            Time now.
+            Present time.
         """
         if not self._in_real_time or self._state.name != "streaming":
             return
@@ -251,7 +251,7 @@ class LineWatch:
         Parameters
         ----------
         t_ns : int
-            Time now.
+            Present time.
 
         Returns
         -------
@@ -267,7 +267,7 @@ class LineWatch:
                 what = "bytes" if self._profile.transport == "serial" else "messages"
                 trouble = (
                     f"{self._undecoded} {what} in {span_ns * NS:.1f} s, and no frame of {self._profile.name} "
-                    "in them that gives a sample: check the profile and the line settings, or stop this and "
+                    "in them: check the profile and the line settings, or stop this and "
                     "run `imudrv doctor` on the port"
                 )
                 self._enter(LineState("unreadable", trouble))
@@ -280,56 +280,56 @@ class LineWatch:
 
 
 def line_load(profile: Profile) -> float:
-    """Fraction of the line that a profile's samples take; on CAN with the bits that stuffing adds at worst.
+    """Return the fraction of the line's capacity that the samples take; on CAN with worst-case bit stuffing.
 
     Parameters
     ----------
     profile : Profile
-        Its line settings and rate.
+        Profile with its line settings and rate.
 
     Returns
     -------
     float
-        More than 1: they do not fit.
+        More than 1: the line is too slow.
     """
     line, rate = profile.line, profile.sample_rate_hz
     if isinstance(line, SerialLine):
         return profile.transmission_ns * NS * rate
     if line.data_bitrate is not None:
         return _STUFFING * (profile.transmission_ns * NS + _IDLE_BITS / line.bitrate) * rate
-    # ISO 11898-1: after five equal bits one is stuffed, in the 34 bits and the data that are stuffed at all
+    # ISO 11898-1: a bit is stuffed after five equal ones, in 34 bits of overhead and in the data
     bits = (8 * m.length + 44 + _IDLE_BITS + (34 + 8 * m.length - 1) // 4 for m in profile.messages)
     shares = (b / m.every for b, m in zip(bits, profile.messages, strict=True))
     return sum(shares) * rate / line.bitrate
 
 
-def explain(profile: Profile, heard: TrafficSummary, seconds: float) -> str:
-    """What arrived, in a line for people.
+def explain(profile: Profile, traffic: TrafficSummary, seconds: float) -> str:
+    """Describe received data in one line.
 
     Parameters
     ----------
     profile : Profile
-        As which it was read.
-    heard : Heard
-        What was found.
+        Profile with which it was decoded.
+    traffic : TrafficSummary
+        The data.
     seconds : float
-        How long it took.
+        Time from the first arrival to the last, s.
 
     Returns
     -------
     str
     """
     what = "bytes" if profile.transport == "serial" else "messages"
-    words = [f"{heard.amount / seconds:.0f} {what}/s, {heard.counts.frames} good frames"]
-    if heard.counts.frames:
-        words.append(f"{rate(heard, seconds):.0f} samples/s by the counter, {heard.counts.lost} lost")
-    for reason, count in sorted(heard.rejected.items()):
+    words = [f"{traffic.amount / seconds:.0f} {what}/s, {traffic.counts.frames} good frames"]
+    if traffic.counts.frames:
+        words.append(f"{rate(traffic, seconds):.0f} samples/s by the counter, {traffic.counts.lost} lost")
+    for reason, count in sorted(traffic.rejected.items()):
         words.append(f"{count} x {reason.name.lower().replace('_', ' ')}")
-    if heard.messages:
-        words.append("by id: " + ", ".join(f"{number:03X} {n}" for number, n in heard.messages.items()))
+    if traffic.messages:
+        words.append("by id: " + ", ".join(f"{number:03X} {n}" for number, n in traffic.messages.items()))
     return "; ".join(words)
 
 
-def rate(heard: TrafficSummary, seconds: float) -> float:
-    """Samples a second that the unit counted."""
-    return heard.counts.expected / seconds
+def rate(traffic: TrafficSummary, seconds: float) -> float:
+    """Return the samples per second by the unit's counter."""
+    return traffic.counts.expected / seconds

@@ -1,4 +1,4 @@
-"""The stages in a row, as live samples and recorded ones take them: decode, account, stamp, compensate."""
+"""Processing chain for live and recorded data: decode, count, compensate, stamp."""
 
 from typing import Final, NamedTuple
 
@@ -15,14 +15,14 @@ from imudrv.wire.decoder import FrameDecoder
 
 
 class PipelineOutput(NamedTuple):
-    """What became of one arrival.
+    """Result of one arrival.
 
     Parameters
     ----------
     pulses : ndarray of PULSES
-        Accounted for.
+        Decoded samples.
     increments : ndarray of INCREMENTS
-        Compensated and stamped; with a rate filter that lags, of earlier samples.
+        Compensated and stamped; with a rate filter that lags, they belong to earlier samples.
     """
 
     pulses: Records
@@ -33,16 +33,16 @@ _NOTHING: Final = PipelineOutput(np.zeros(0, PULSES), np.zeros(0, INCREMENTS))
 
 
 class Pipeline:
-    """From what arrives to stamped increments; any cut into pieces gives the same bits.
+    """Converts received data to stamped increments; any cut of the data into pieces gives the same bits.
 
     Parameters
     ----------
     profile : Profile
-        What the unit sends.
+        Profile of the unit.
     coefficients : Coefficients
-        Its calibration.
+        Calibration of the unit.
     rate_filter : RateFilter
-        For the size effect.
+        Rate filter of the size effect.
     """
 
     def __init__(self, profile: Profile, coefficients: Coefficients, rate_filter: RateFilter) -> None:
@@ -54,37 +54,37 @@ class Pipeline:
         self._compensator = Compensator(coefficients, self._layout, rate_filter)
         self._next: Compensator | None = None
         self._repeats = False
-        self._last_ns = 0  # time by the counter of the newest increment handed on, while it matters
+        self._last_ns = 0  # time by the counter of the newest increment output, while it matters
 
     def feed(self, data: bytes | memoryview | Records, t_ns: int) -> PipelineOutput:
-        """Take in what arrived.
+        """Process an arrival.
 
         Parameters
         ----------
         data : bytes-like or ndarray of MESSAGE
             Wire bytes, or CAN messages.
         t_ns : int
-            When, host clock.
+            Time of arrival by the host clock, ns.
 
         Returns
         -------
-        Sampled
+        PipelineOutput
         """
-        return self._through(self.decoder.feed(data, t_ns))
+        return self._process(self.decoder.feed(data, t_ns))
 
     def close(self) -> PipelineOutput:
-        """End of the line: what was held back comes out."""
-        pulses, increments = self._through(self.decoder.close())
+        """End the stream and return what was held back."""
+        pulses, increments = self._process(self.decoder.close())
         rest = self._compensator.close()
         if self._repeats:
-            rest = self._unrepeated(rest)
+            rest = self._drop_overlap(rest)
         return PipelineOutput(pulses, np.concatenate([increments, self.clock.stamp(rest)]))
 
-    def exchange(self, coefficients: Coefficients) -> None:
-        """Go over to another calibration between two samples.
+    def replace_calibration(self, coefficients: Coefficients) -> None:
+        """Replace the calibration between two samples.
 
-        The new one is first fed beside the old one until it knows the rates, so that no sample misses its
-        size effect.
+        The new compensation first runs beside the old one until its rates are known, so that no sample
+        lacks its size effect.
 
         Parameters
         ----------
@@ -95,11 +95,11 @@ class Pipeline:
         self._repeats = True
 
     @property
-    def exchanging(self) -> bool:
-        """Whether a new calibration is still on its way in."""
+    def replacing(self) -> bool:
+        """Whether a new calibration is not in use yet."""
         return self._next is not None
 
-    def _through(self, frames: Records) -> PipelineOutput:
+    def _process(self, frames: Records) -> PipelineOutput:
         if not len(frames):
             return _NOTHING
         pulses = self.tracker.feed(frames)
@@ -108,13 +108,13 @@ class Pipeline:
         self.clock.feed(pulses)
         increments = self._compensator.feed(pulses)
         if self._next is not None:
-            increments = self._exchanged(self._next, pulses, increments)
+            increments = self._switched(self._next, pulses, increments)
         if self._repeats:
-            increments = self._unrepeated(increments)
+            increments = self._drop_overlap(increments)
         return PipelineOutput(pulses, self.clock.stamp(increments))
 
-    def _exchanged(self, new: Compensator, pulses: Records, old: Records) -> Records:
-        """Increments of the old calibration up to where the new one knows its rates, then of the new one."""
+    def _switched(self, new: Compensator, pulses: Records, old: Records) -> Records:
+        """Return increments of the old calibration until the new one knows its rates, then of the new one."""
         fresh = new.feed(pulses)
         if new.has_size_effect:
             ready = fresh["flags"] & Flag.SIZE_EFFECT != 0
@@ -128,11 +128,11 @@ class Pipeline:
         self._compensator, self._next = new, None
         return np.concatenate([old[old["t_ns"] < since], fresh[fresh["t_ns"] >= since]])
 
-    def _unrepeated(self, increments: Records) -> Records:
-        """Leave out what was handed on: after an exchange, one that lags more gives some samples again."""
+    def _drop_overlap(self, increments: Records) -> Records:
+        """Drop increments already output: a new compensation that lags more gives some samples again."""
         fresh = increments[increments["t_ns"] > self._last_ns]
         if len(fresh):
-            # Nothing is repeated any more once the new one has come past what the old one gave.
+            # Nothing is repeated once the new one has passed the last increment of the old one.
             self._repeats = self._next is not None or len(fresh) < len(increments)
             self._last_ns = int(fresh["t_ns"][-1])
         return fresh

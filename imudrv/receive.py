@@ -1,4 +1,4 @@
-"""The other end: samples of a running driver in another program.
+"""Receive the samples of a running driver in another program.
 
 with imudrv.receive("udp://:5005") as receiver:
     for increments in receiver:
@@ -31,7 +31,7 @@ from imudrv.wire.layout import Layout
 _EXPECTED: Final = "udp://[HOST]:PORT, tcp://HOST:PORT or serial:///dev/ttyUSB0?baudrate=921600"
 _LOOPBACK: Final = "127.0.0.1"
 _AT_ONCE: Final = 1 << 16
-_QUEUE: Final = 1 << 22  # the system's usual one holds a quarter of a second of single samples
+_QUEUE: Final = 1 << 22  # the system's default holds a quarter of a second of single samples
 _CONNECT_S: Final = 5.0
 _COUNTED: Final = Layout(
     name="I50N",
@@ -47,23 +47,23 @@ _COUNTED: Final = Layout(
 
 
 class Receiver:
-    """Samples as they come: an iterator over arrays of one or more; made by `receive`.
+    """Iterator over arrays of one or more samples as they arrive; made by `receive`.
 
-    Each sample comes once and in the order of the counter: a duplicate or late one, as a network may make
-    them, is counted and left out. The iteration ends when the other end has gone, or after a wait of
-    `timeout_s` in vain. It is a context manager and closes what it opened.
+    Each sample comes once and in the order of the counter: one that the network duplicates or delays is
+    counted and dropped. The iteration ends when the sender closes the connection or nothing arrives for
+    `timeout_s`. It is a context manager that closes the connection.
 
     Parameters
     ----------
     url : str
         See `receive`.
     timeout_s : float or None
-        Longest wait; None: for ever.
+        Longest wait, s; None: no limit.
 
     Attributes
     ----------
     rejected_bytes : int
-        What came and was no datagram.
+        Number of received bytes that belong to no valid datagram.
     """
 
     def __init__(self, url: str, timeout_s: float | None) -> None:
@@ -71,7 +71,7 @@ class Receiver:
         self._timeout_s = timeout_s
         self._decoder = DatagramDecoder()
         self._tracker = SequenceTracker(_COUNTED)
-        self._ordered(b"")  # whatever has to be compiled is compiled before samples wait
+        self._ordered(b"")  # compiles the kernels before samples arrive
         self._device = _open(split(url))
         self._is_packets = isinstance(self._device, socket.socket) and (
             self._device.type == socket.SOCK_DGRAM
@@ -85,12 +85,12 @@ class Receiver:
 
     @property
     def counts(self) -> SampleCounts:
-        """Samples by what became of them."""
+        """Sample counts so far."""
         return self._tracker.counts
 
     @property
     def lost(self) -> int:
-        """Samples that were sent, by their counter, and not output."""
+        """Number of samples that were sent, by their counter, and not output."""
         return self.counts.lost
 
     def __iter__(self) -> Self:
@@ -117,7 +117,7 @@ class Receiver:
         raise StopIteration
 
     def close(self) -> None:
-        """Give the port back; the iteration ends."""
+        """Close the connection; the iteration ends."""
         self._is_open = False
         self._device.close()
 
@@ -130,12 +130,12 @@ class Receiver:
         self.close()
 
     def _ordered(self, data: bytes) -> Records:
-        """Samples in `data` that are new and in order."""
+        """Return the samples in `data` that are new and in order."""
         received = self._decoder.feed(data)
         self.rejected_bytes += int(received.rejects["length"].sum())
         frames = np.zeros(len(received.increments), FRAME)
         frames["counter"] = received.increments["counter"]
-        frames["t_ns"] = np.arange(len(frames))  # comes back as the arrival: which ones were good
+        frames["t_ns"] = np.arange(len(frames))  # index, returned as the arrival time of the good ones
         in_order: Records = received.increments[self._tracker.feed(frames)["arrival_ns"]]
         return in_order
 
@@ -149,19 +149,19 @@ def receive(url: str, timeout_s: float | None = None) -> Receiver:
         ``udp://[HOST]:PORT`` listens, on the loopback unless another HOST of this machine is given;
         ``tcp://HOST:PORT`` connects; ``serial:///dev/ttyUSB0?baudrate=921600`` opens a line.
     timeout_s : float, optional
-        Longest wait for samples, after which the iteration ends; without it there is no end to the wait.
+        Longest wait for samples, s, after which the iteration ends; by default there is no limit.
 
     Returns
     -------
     Receiver
-        To iterate over.
+        Iterator over the samples.
 
     Raises
     ------
     InputError
-        It is no such URL.
+        The URL is wrong.
     PortLostError
-        It cannot be opened now: nobody serves there, the port is taken, the line is not there.
+        It cannot be opened now: no driver listens there, the port is in use, the line does not exist.
     """
     return Receiver(url, timeout_s)
 

@@ -1,4 +1,4 @@
-"""An open line is judged by what it brings; the clock here is the test's own."""
+"""An open line is judged by the data that it delivers; the test sets the clock."""
 
 import random
 from collections.abc import Iterable, Iterator
@@ -30,15 +30,15 @@ def states(
 
     `stalls`: begin and end, s; what was sent meanwhile arrives afterwards.
     """
-    begin_ns, told = round(begin_s * NS_PER_S), 0
+    begin_ns, sent = round(begin_s * NS_PER_S), 0
     blocked = [range(round(a * NS_PER_S), round(b * NS_PER_S)) for a, b in stalls]
     for t_ns in range(begin_ns, begin_ns + round(seconds * NS_PER_S), TURN_NS):
         samples = int((t_ns - begin_ns) * rate_hz / NS_PER_S)
-        if samples > told and not any(t_ns in span for span in blocked):
-            watch.arrived((samples - told) * LENGTH, samples - told, t_ns)
-            told = samples
+        if samples > sent and not any(t_ns in span for span in blocked):
+            watch.arrived((samples - sent) * LENGTH, samples - sent, t_ns)
+            sent = samples
         if t_ns % NS_PER_S == 0:
-            watch.counted(told, t_ns)
+            watch.counted(sent, t_ns)
         yield t_ns / NS_PER_S, watch.state(t_ns)
 
 
@@ -122,8 +122,8 @@ def test_a_wrong_rate_is_reported_within_five_seconds(rate_hz: float) -> None:
 def test_a_wrong_rate_is_reported_once_however_the_machine_stalls(rate_hz: float) -> None:
     chance = random.Random(2)
     for _ in range(20):
-        seen = states(LineWatch(RS422, True, 0), rate_hz, 20.0, stalls=random_stalls(chance))
-        changes = [after for (_, before), (_, after) in pairwise(seen) if after != before]
+        found = states(LineWatch(RS422, True, 0), rate_hz, 20.0, stalls=random_stalls(chance))
+        changes = [after for (_, before), (_, after) in pairwise(found) if after != before]
         assert len(changes) == 1
 
 
@@ -141,7 +141,7 @@ def test_what_was_counted_before_a_silence_does_not_count_after_it() -> None:
     assert set(after) == {STREAMING}
 
 
-def test_a_burst_of_old_frames_and_a_leap_of_the_counter_are_no_rate() -> None:
+def test_a_burst_of_old_frames_and_a_jump_of_the_counter_do_not_change_the_rate() -> None:
     for at in (1, 2, 3, 7):
         watch = LineWatch(RS422, True, 0)
         expected = 0
@@ -152,5 +152,5 @@ def test_a_burst_of_old_frames_and_a_leap_of_the_counter_are_no_rate() -> None:
             assert watch.state(second * NS_PER_S) == STREAMING
 
 
-def test_the_rate_of_a_unit_that_does_not_send_at_its_own_pace_is_not_judged() -> None:
+def test_the_rate_of_a_unit_that_does_not_send_at_its_own_pace_is_not_checked() -> None:
     assert {state for _, state in states(LineWatch(RS422, False, 0), 50_000.0, 10.0)} == {STREAMING}

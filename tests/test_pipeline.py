@@ -47,19 +47,19 @@ def through(pipeline: Pipeline, frames: list[bytes], first: int = 0) -> list[Rec
 
 @pytest.mark.parametrize("name", ["causal", "centred", "dither"])
 @pytest.mark.parametrize(("old", "new"), [(ARMS, LONGER), (BARE, ARMS), (ARMS, BARE)])
-def test_a_calibration_is_exchanged_without_a_sample_lost_doubled_or_left_uncompensated(
+def test_a_calibration_is_replaced_without_a_sample_lost_doubled_or_left_uncompensated(
     name: RateFilterName, old: Coefficients, new: Coefficients
 ) -> None:
     frames = wire()
     rates = rate_filter(name, TAU_NS)
     pipeline = Pipeline(PROFILE, old, rates)
     before = through(pipeline, frames[:200])
-    pipeline.exchange(new)
+    pipeline.replace_calibration(new)
     after = through(pipeline, frames[200:], 200)
     got = np.concatenate([*before, *after, pipeline.close().increments])
 
     assert got["counter"].tolist() == list(range(SAMPLES))
-    assert not pipeline.exchanging
+    assert not pipeline.replacing
     alone = [
         np.concatenate([*through(p, frames), p.close().increments])
         for p in (Pipeline(PROFILE, old, rates), Pipeline(PROFILE, new, rates))

@@ -39,7 +39,7 @@ def test_an_output_that_takes_nothing_costs_the_oldest_lines_and_says_how_many()
         for line in said:
             printer.say(line)
         until(printer.notices, "a notice")
-        found = re.search(r"takes no text.*waiting lines: (\d+), lost: (\d+)", *printer.notices())
+        found = re.search(r"accepts no text.*waiting lines: (\d+), lost: (\d+)", *printer.notices())
         assert found
         # what is neither waiting nor lost has been taken by the pipe
         assert len(said) - (1 << 16) // LINE_BYTES <= int(found[1]) + int(found[2]) <= len(said)

@@ -17,7 +17,7 @@ from imudrv.records import INCREMENTS, Records, Source
 from imudrv.wire.datagram import SIZE, encode
 
 WAIT_S = 20.0
-"""So long a sample may take on a busy machine before a test fails."""
+"""Longest wait for a sample on a busy machine before a test fails."""
 
 
 def increments(count: int, first: int = 0) -> Records:
@@ -44,17 +44,17 @@ def take(receiver: Receiver, count: int) -> Records:
 
 
 class Udp:
-    """A receiver and somebody who sends to it."""
+    """A receiver and its sender."""
 
     def __init__(self, sender: socket.socket) -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             probe.bind(("127.0.0.1", 0))
-            self._address = probe.getsockname()
+            self.address = probe.getsockname()
         self._sender = sender
-        self.receiver = receive(f"udp://:{self._address[1]}", timeout_s=WAIT_S)
+        self.receiver = receive(f"udp://:{self.address[1]}", timeout_s=WAIT_S)
 
     def send(self, packet: bytes) -> None:
-        self._sender.sendto(packet, self._address)
+        self._sender.sendto(packet, self.address)
 
 
 @pytest.fixture
@@ -85,7 +85,7 @@ def test_what_is_missing_is_counted_across_the_wrap_of_the_counter(udp: Udp) -> 
     assert udp.receiver.counts.closes
 
 
-def test_duplicate_and_late_samples_are_left_out_and_counted(udp: Udp) -> None:
+def test_duplicate_and_late_samples_are_dropped_and_counted(udp: Udp) -> None:
     sent = increments(8)
     for k in (0, 1, 1, 4, 3, 5, 0, 6, 7):
         udp.send(datagrams(sent[k : k + 1]))
@@ -94,7 +94,7 @@ def test_duplicate_and_late_samples_are_left_out_and_counted(udp: Udp) -> None:
     assert (counts.duplicate, counts.out_of_order, counts.missing, udp.receiver.lost) == (2, 1, 1, 2)
 
 
-def test_a_driver_that_begins_anew_loses_nothing(udp: Udp) -> None:
+def test_a_restart_of_the_driver_loses_nothing(udp: Udp) -> None:
     udp.send(datagrams(increments(3, first=5_000)))
     udp.send(datagrams(increments(3)))
     assert take(udp.receiver, 6)["counter"].tolist() == [5_000, 5_001, 5_002, 0, 1, 2]
@@ -102,7 +102,7 @@ def test_a_driver_that_begins_anew_loses_nothing(udp: Udp) -> None:
     assert udp.receiver.counts.restarts == 1
 
 
-def test_packets_that_are_no_datagrams_cost_nothing(udp: Udp) -> None:
+def test_packets_that_are_no_datagrams_are_rejected_and_counted(udp: Udp) -> None:
     sent = increments(2)
     packet = datagrams(sent)
     for junk in (b"", b"I50N", packet[:40], b"hello", bytes(2000), packet[:SIZE][::-1]):
@@ -116,12 +116,12 @@ def test_packets_that_are_no_datagrams_cost_nothing(udp: Udp) -> None:
     assert udp.receiver.rejected_bytes == junk_bytes
 
 
-def test_udp_listens_on_the_loopback_unless_told_otherwise(udp: Udp) -> None:
+def test_udp_listens_on_the_loopback_by_default(udp: Udp) -> None:
     with pytest.raises(PortLostError, match=r"cannot listen \(Address already in use\)"):
-        receive(f"udp://127.0.0.1:{udp._address[1]}")
+        receive(f"udp://127.0.0.1:{udp.address[1]}")
 
 
-def test_waiting_in_vain_ends_the_iteration() -> None:
+def test_a_timeout_ends_the_iteration() -> None:
     with receive("udp://127.0.0.1:0", timeout_s=0.01) as receiver:
         assert list(receiver) == []
 
@@ -175,12 +175,12 @@ def test_a_serial_line_brings_every_sample_until_it_is_unplugged() -> None:
         "5005",
     ],
 )
-def test_a_url_that_makes_no_sense_is_told_so(url: str) -> None:
+def test_a_wrong_url_is_reported(url: str) -> None:
     with pytest.raises(InputError, match=rf"^'?{url.replace('?', '[?]')}'?: expected .*://"):
         receive(url)
 
 
-def test_where_nobody_serves_the_message_says_what_to_do() -> None:
+def test_without_a_driver_the_message_says_what_to_do() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
     with pytest.raises(

@@ -25,7 +25,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from imudrv.calibration import write_calibration
 from imudrv.errors import InputError
-from imudrv.hostclock import now_ns
 from imudrv.profiles import load
 from imudrv.receive import receive
 from imudrv.recording.reader import Recording
@@ -107,7 +106,7 @@ class Unit:
                 time.sleep(0.001)
 
     def skip(self, count: int) -> None:
-        """Numbers that the unit counts while nobody hears."""
+        """Advance the unit's counter without sending."""
         self.counter += count
 
 
@@ -127,7 +126,6 @@ class Service:
             text=True,
         )
         self.said: list[str] = []
-        self.said: list[str] = []
         self.warned: list[str] = []
         self._listeners = [
             threading.Thread(target=lines.extend, args=[stream])
@@ -138,7 +136,7 @@ class Service:
             listener.start()
         if self.process.stdout is not None:
             until(lambda: self.said or self.process.poll() is not None, "the first line")
-            assert self.heard("serving"), self.said + self.warned
+            assert self.logged("serving"), self.said + self.warned
 
     def status(self) -> dict[str, Any]:
         return ask(self.socket)
@@ -156,7 +154,7 @@ class Service:
         except InputError:
             return False
 
-    def heard(self, words: str) -> bool:
+    def logged(self, words: str) -> bool:
         return any(words in line for line in [*self.said, *self.warned])
 
     def command(self, *arguments: str) -> subprocess.CompletedProcess[str]:
@@ -265,17 +263,19 @@ def test_every_sample_comes_out_in_order_and_as_the_offline_command_makes_it(fol
         np.testing.assert_array_equal(recorded[name], live[name], err_msg=name)
 
 
-def test_an_unplug_is_told_and_after_the_replug_the_stream_goes_on_with_the_gap_flagged(folder: Path) -> None:
+def test_an_unplug_is_reported_and_after_the_replug_the_stream_continues_with_the_gap_flagged(
+    folder: Path,
+) -> None:
     unit = Unit(folder / "unit")
     with serving(folder, *serial(folder), "--record", "run.mcap") as service:
         unit.send(300)
         until(lambda: service.good() == 300, "the first 300 samples")
         unit.unplug()
-        until(lambda: service.heard("port lost"), "the loss told")
+        until(lambda: service.logged("port lost"), "the loss reported")
         until(lambda: service.status()["health"] == "fail", "the loss in the status")
         unit.skip(50)
         unit.plug()
-        until(lambda: service.heard("port is back"), "the port again")
+        until(lambda: service.logged("port is back"), "the port again")
         unit.send(300)
         until(lambda: service.good() == 600, "the other 300 samples")
         status = service.status()
@@ -288,15 +288,15 @@ def test_an_unplug_is_told_and_after_the_replug_the_stream_goes_on_with_the_gap_
     assert increments["counter"][flagged].tolist() == [350]
 
 
-def test_silence_is_told_and_nothing_exits(folder: Path) -> None:
+def test_silence_is_reported_and_nothing_exits(folder: Path) -> None:
     unit = Unit(folder / "unit")
     with serving(folder, *serial(folder)) as service:
-        until(lambda: service.heard("silent"), "silence told")
+        until(lambda: service.logged("silent"), "silence reported")
         unit.send(100)
-        until(lambda: service.heard("the unit is back"), "the unit heard again")
+        until(lambda: service.logged("the unit is back"), "the unit received again")
         until(lambda: service.good() == 100, "its samples")
         assert service.stop(signal.SIGINT) == 0
-        assert service.heard("100 good")
+        assert service.logged("100 good")
     assert not service.socket.exists()
 
 
@@ -310,13 +310,13 @@ def test_bytes_without_a_frame_are_a_failure_until_frames_come_again(folder: Pat
         with repeating(lambda: unit.write(garbage)):
             until(lambda: service.status()["health"] == "fail", "the failure in the status")
             until(lambda: service.status()["port"]["state"] == "unreadable", "what has failed")
-            told = service.command("status")
-            assert told.returncode == 4
+            answer = service.command("status")
+            assert answer.returncode == 4
             found = re.match(
                 r"fail\nport unreadable: (\d+) bytes in \d+\.\d s, and no frame of imu50-rs422 in them",
-                told.stdout,
+                answer.stdout,
             )
-            assert found, told.stdout
+            assert found, answer.stdout
             assert int(found[1]) >= len(garbage)
             assert "unreadable" in service.command("monitor").stdout
             assert any(found[0].removeprefix("fail\n") in line for line in service.warned)
@@ -338,7 +338,7 @@ def test_a_unit_at_another_rate_than_its_profile_is_reported_with_both_rates(fol
     text = (resources.files("imudrv.profiles") / "imu50-rs422.yaml").read_text("utf-8")
     (folder / "slow.yaml").write_text(text.replace("sample_rate_hz: 1000", "sample_rate_hz: 200"))
     with simulated(folder, "slow.yaml"), serving(folder, *serial(folder)) as service:
-        until(lambda: service.heard("the unit counts"), "the rate")
+        until(lambda: service.logged("the unit counts"), "the rate")
         until(lambda: service.status()["port"]["trouble"], "the rate in the status")
         status = service.status()
         assert status["health"] == "warn"
@@ -348,7 +348,7 @@ def test_a_unit_at_another_rate_than_its_profile_is_reported_with_both_rates(fol
         assert service.stop() == 0
 
 
-def test_a_simulated_unit_at_another_speed_is_not_said_to_be_at_a_wrong_rate(folder: Path) -> None:
+def test_the_rate_of_a_simulated_unit_at_another_speed_is_not_checked(folder: Path) -> None:
     arguments = ["--port", "sim://static?speed=10", *serial(folder)[2:]]
     with serving(folder, *arguments) as service:
         until(lambda: service.good() > 60_000, "six seconds' samples")  # a rate is judged after four
@@ -356,7 +356,7 @@ def test_a_simulated_unit_at_another_speed_is_not_said_to_be_at_a_wrong_rate(fol
         assert service.stop() == 0
 
 
-def test_a_calibration_is_exchanged_while_running_and_a_bad_one_is_refused(folder: Path) -> None:
+def test_a_calibration_is_replaced_while_running_and_a_bad_one_is_refused(folder: Path) -> None:
     unit = Unit(folder / "unit")
     with serving(folder, *serial(folder), "--record", "run.mcap") as service:
         unit.send(200)
@@ -422,10 +422,10 @@ def test_constants_and_sha256_agree_however_the_calibration_file_is_replaced(
             scale = service.status()["last"]["dtheta_b"][0] / angle
             assert scale / ARCSEC == pytest.approx({"a": 0.5, "b": 1.0}[units[left]], rel=1e-9)  # rounding
         assert service.stop() == 0
-    exchanged = [t.split()[-1] for _, t in Recording(folder / "run.mcap").events() if "exchanged" in t]
+    replaced = [t.split()[-1] for _, t in Recording(folder / "run.mcap").events() if "replaced" in t]
     attached = [c.serial_number for _, c in Recording(folder / "run.mcap").calibrations()]
     short = {digest[:12]: name for digest, name in units.items()}
-    assert attached == ["a", *(short[digest] for digest in exchanged)]
+    assert attached == ["a", *(short[digest] for digest in replaced)]
 
 
 def test_at_the_start_constants_and_sha256_agree_too(
@@ -442,10 +442,9 @@ def test_at_the_start_constants_and_sha256_agree_too(
     with replaced_at_random(folder / "unit.yaml", list(contents.values()), seed=11):
         for _ in range(40):
             service = Driver(settings, lambda _: None)
-            status = service.status(now_ns())
-            service.stop()
-            service.run()
-            assert status["unit"] == units[status["calibration"]["sha256"]]
+            status = service.status
+            service.close()
+            assert status.unit == units[status.calibration.sha256]
 
 
 def test_a_reader_of_its_text_that_leaves_costs_the_text_alone(folder: Path) -> None:
@@ -505,7 +504,7 @@ def test_a_stopped_terminal_holds_its_text_alone(folder: Path) -> None:
             until(lambda: service.status()["port"]["state"] == "lost", "the loss")
             unit.plug()
             until(lambda n=reconnects: service.status()["port"]["reconnects"] == n, "the port again")
-        until(lambda: "stdout: takes no text" in service.notices(), "a warning")
+        until(lambda: "stdout: accepts no text" in service.notices(), "a warning")
         assert counters == list(range(300))
         termios.tcflow(slave, termios.TCOON)
         until(lambda: printed(b"port is back", 3), "what was held back")
@@ -527,7 +526,7 @@ def test_a_sighup_while_it_starts_does_not_end_it(folder: Path) -> None:
         assert service.stop() == 0
 
 
-def test_it_ends_when_its_terminal_has_gone_and_not_as_if_somebody_had_asked(folder: Path) -> None:
+def test_it_ends_with_another_exit_code_when_its_terminal_has_gone(folder: Path) -> None:
     unit = Unit(folder / "unit")
     master, slave = pty.openpty()
     with serving(folder, *serial(folder), stdin=slave) as service:
@@ -536,7 +535,7 @@ def test_it_ends_when_its_terminal_has_gone_and_not_as_if_somebody_had_asked(fol
         until(lambda: service.good() == 100, "the samples")
         os.close(master)
         assert service.stop(signal.SIGHUP) == INTERRUPTED
-        assert service.heard("100 good")
+        assert service.logged("100 good")
 
 
 def test_a_calibration_of_another_unit_is_refused_at_the_start(folder: Path) -> None:
@@ -615,7 +614,7 @@ def test_a_status_for_scripts_and_one_for_people(folder: Path) -> None:
     assert "expected a running service" in gone.stderr
 
 
-def test_the_service_manager_is_told(folder: Path) -> None:
+def test_the_service_manager_is_notified(folder: Path) -> None:
     unit = Unit(folder / "unit")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(folder / "notify"))
@@ -640,7 +639,7 @@ def test_a_replay_of_a_capture_gives_what_the_offline_command_gives(folder: Path
     arguments = ["--port", "replay://run.raw?speed=max", *serial(folder)[2:], "--out", "file:live.i50n"]
     with serving(folder, *arguments) as service:
         assert service.ended() == 0
-        assert service.heard("2999 samples by the counter = 2999 good")
+        assert service.logged("2999 samples by the counter = 2999 good")
     command = [sys.executable, "-m", "imudrv", "compensate", "run.raw", *map(str, serial(folder)[2:])]
     subprocess.run([*command, "-o", "offline.i50n"], cwd=folder, check=True, timeout=300, capture_output=True)
     live, offline = (np.fromfile(folder / f"{n}.i50n", "u1").reshape(-1, 76) for n in ("live", "offline"))

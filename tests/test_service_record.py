@@ -131,7 +131,7 @@ def test_a_recording_begins_at_a_sample_that_is_past_where_there_is_a_history(
         assert np.array_equal(again[name][whole], published[name][whole])
 
 
-def test_after_an_exchange_of_the_calibration_a_recording_begins_with_the_new_one(tmp_path: Path) -> None:
+def test_after_a_replacement_of_the_calibration_a_recording_begins_with_the_new_one(tmp_path: Path) -> None:
     write_calibration(tmp_path / "unit.yaml", NOMINAL)
     settings = Settings(
         port="sim://static?speed=20",
@@ -145,7 +145,7 @@ def test_after_an_exchange_of_the_calibration_a_recording_begins_with_the_new_on
     def ask() -> None:
         wait_for(own, 3000)
         write_calibration(tmp_path / "unit.yaml", NOMINAL.model_copy(update={"size_effect": None}))
-        while not any("calibration exchanged" in text for text in said):
+        while not any("calibration replaced" in text for text in said):
             wait_for(own, 10)
         service.record(tmp_path / "past.mcap", since=1000).result(DEADLINE_S)
         wait_for(own, 1000)
@@ -184,7 +184,7 @@ def test_a_recording_has_the_calibration_in_use_while_its_file_is_away(tmp_path:
     assert Recording(tmp_path / "run.mcap").calibration == NOMINAL
 
 
-def test_a_request_that_the_end_overtakes_is_given_up(tmp_path: Path) -> None:
+def test_a_request_that_the_end_overtakes_is_cancelled(tmp_path: Path) -> None:
     write_calibration(tmp_path / "unit.yaml", NOMINAL)
     settings = Settings(
         port=str(tmp_path / "nothing"),

@@ -1,34 +1,87 @@
-import json
+import os
+import pty
+import tty
 from pathlib import Path
 
+import numpy as np
+import pytest
+
 from imudrv.calibration import write_calibration
+from imudrv.errors import InputError
 from imudrv.hostclock import now_ns
-from imudrv.service.loop import Service
+from imudrv.profiles import load
+from imudrv.records import PULSES
+from imudrv.service.loop import POLL_NS, Service
 from imudrv.service.settings import Settings
+from imudrv.service.status import Status
 from imudrv.sim.scenario import NOMINAL
+from imudrv.units import NS_PER_S
+from imudrv.wire.encode import StreamEncoder
 
 
-def test_the_status_has_news_at_the_next_turn_and_the_rate_is_still_over_a_whole_second(
-    tmp_path: Path,
-) -> None:
+class Clock:
+    """A clock that the test sets."""
+
+    def __init__(self) -> None:
+        self.t_ns = now_ns()
+
+    def __call__(self) -> int:
+        return self.t_ns
+
+
+def test_an_event_is_published_at_once_and_the_rate_is_still_over_a_whole_second(tmp_path: Path) -> None:
     write_calibration(tmp_path / "unit.yaml", NOMINAL)
+    master, slave = pty.openpty()
+    tty.setraw(slave)
     settings = Settings(
-        port=str(tmp_path / "nothing"),
+        port=os.ttyname(slave),
         profile="imu50-rs422",
         calibration=str(tmp_path / "unit.yaml"),
         status=str(tmp_path / "socket"),
     )
+    clock = Clock()
+    service = Service(settings, lambda _: None, clock=clock)
+    try:
+        service.step()
+        samples = np.zeros(100, PULSES)
+        samples["counter"] = np.arange(100)
+        wire = StreamEncoder(load("imu50-rs422").layout()).encode(samples).tobytes()
+        os.write(master, wire)  # 100 frames of 38 bytes are less than a pty holds
+        for _ in range(10):  # one read, or more if the system cuts the bytes
+            service.step()
+        clock.t_ns += NS_PER_S - POLL_NS
+        os.close(slave)
+        os.close(master)
+        service.step()
+        assert "port lost" in service.status.events[-1]
+        assert service.status.rate_hz == 0.0
+        clock.t_ns += POLL_NS
+        service.step()
+        assert service.status.samples.good == 100
+        assert service.status.rate_hz == 100.0
+    finally:
+        service.close()
+
+
+def test_a_status_is_the_same_after_json_and_one_of_another_program_is_refused(tmp_path: Path) -> None:
+    write_calibration(tmp_path / "unit.yaml", NOMINAL)
+    settings = Settings(
+        port="sim://static?speed=max",
+        profile="imu50-rs422",
+        calibration=str(tmp_path / "unit.yaml"),
+        outputs=(f"file:{tmp_path / 'out.i50n'}",),
+        record=str(tmp_path / "run.mcap"),
+        status=str(tmp_path / "socket"),
+    )
     service = Service(settings, lambda _: None)
     try:
-        now = now_ns() + 1_000_000_000
-        service._poll(now)
-        service._samples += 100
-        service._event("something happened")
-        service._poll(now + 100_000_000)
-        status = json.loads(service._line)
-        assert status["events"][-1].endswith("something happened")
-        assert status["rate_hz"] == 0.0
-        service._poll(now + 1_000_000_000)
-        assert json.loads(service._line)["rate_hz"] == 100.0
+        service.step()
     finally:
-        service._open.close()
+        service.close()
+    document = service.status.to_json()
+    assert document["samples"]["good"] > 0
+    assert document["recording"]["url"].endswith("run.mcap")
+    assert Status.from_json(document) == service.status
+    del document["port"]["state"]
+    with pytest.raises(InputError, match=r"status: port\.state: Field required; restart the service"):
+        Status.from_json(document)

@@ -1,6 +1,7 @@
 """Find out why a unit is not received, and what to do.
 
-examine   the steps from the device to the traffic
-device    the device: does it exist, may it be opened, who else has it
-verdict   the result of a step
+examine   steps from the device to the data
+device    the device: does it exist, can it be opened, do other programs use it
+traffic   findings about received data
+verdict   finding of one step
 """

@@ -1,6 +1,7 @@
-"""The device of a port: whether it exists, may be opened, and who else has it."""
+"""The device of a port: does it exist, can it be opened, do other programs use it, does it add latency."""
 
 import grp
+import math
 import os
 import resource
 from collections.abc import Iterator
@@ -23,7 +24,7 @@ _IFF_UP: Final = 1
 
 @dataclass(frozen=True)
 class System:
-    """Where the system tells about itself.
+    """Folders in which the system describes itself.
 
     Parameters
     ----------
@@ -37,23 +38,21 @@ class System:
 
 
 def limits() -> Iterator[Finding]:
-    """Whether a real-time place and locked memory would be granted to this user."""
+    """Check that `--realtime` would be granted to this user: scheduling priority and locked memory."""
     for name, limit, enough, key, unit in (
         ("real-time priority", resource.RLIMIT_RTPRIO, PRIORITY, "rtprio 50", "LimitRTPRIO=50"),
-        ("locked memory", resource.RLIMIT_MEMLOCK, None, "memlock unlimited", "LimitMEMLOCK=infinity"),
+        ("locked memory", resource.RLIMIT_MEMLOCK, math.inf, "memlock unlimited", "LimitMEMLOCK=infinity"),
     ):
         soft, _ = resource.getrlimit(limit)
-        unlimited = soft == resource.RLIM_INFINITY
-        if os.geteuid() == 0 or unlimited or (enough is not None and soft >= enough):
-            yield Finding(name, Verdict.OK, "--realtime would get it")
+        if os.geteuid() == 0 or soft == resource.RLIM_INFINITY or soft >= enough:
+            yield Finding(name, Verdict.OK, "enough for --realtime")
         else:
-            yield Finding(
-                name,
-                Verdict.WARN,
-                f"the limit is {soft}: --realtime would be refused; only a loaded machine needs it",
+            found = f"the limit is {soft}: --realtime would be refused; it matters only on a loaded machine"
+            fix = (
                 f"put the line '{_user()} - {key}' into /etc/security/limits.d/imu50.conf and log in again, "
-                f"or {unit} into the systemd unit",
+                f"or {unit} into the systemd unit"
             )
+            yield Finding(name, Verdict.WARN, found, fix)
 
 
 def _user() -> str:
@@ -61,49 +60,34 @@ def _user() -> str:
 
 
 def device_steps(device: Path, system: System) -> Iterator[Finding]:
-    """Examine the device of a serial port."""
+    """Check the device of a serial port."""
     if not device.exists():
-        there = [str(path) for path in candidates(system)]
-        yield Finding(
-            "device",
-            Verdict.FAIL,
-            f"there is no {device}",
-            f"take one of {', '.join(there)}"
-            if there
-            else "plug the unit's adapter in; there is no serial port here at all",
+        ports = ", ".join(map(str, candidates(system)))
+        fix = (
+            f"use one of {ports}" if ports else "plug in the unit's adapter; this machine has no serial port"
         )
+        yield Finding("device", Verdict.FAIL, f"{device} does not exist", fix)
         return
     target = device.resolve()
     yield Finding("device", Verdict.OK, str(device) if target == device else f"{device} is {target}")
-    if os.access(device, os.R_OK | os.W_OK):
-        yield Finding("permission", Verdict.OK, "this user may open it")
-    else:
+    if not os.access(device, os.R_OK | os.W_OK):
         group = _group(device)
-        yield Finding(
-            "permission",
-            Verdict.FAIL,
-            f"this user may not open {device}; the group {group} may",
-            f"sudo usermod -aG {group} {_user()}, then log in again; or install the udev rule {RULES}",
-        )
+        found = f"this user cannot open {device}; members of the group {group} can"
+        fix = f"sudo usermod -aG {group} {_user()}, then log in again; or install the udev rule {RULES}"
+        yield Finding("permission", Verdict.FAIL, found, fix)
         return
-    there_are, all_seen = holders(target, system)
-    if there_are:
-        yield Finding(
-            "busy",
-            Verdict.FAIL,
-            f"open in {', '.join(there_are)}: each program would get a part of the bytes",
-            "end that program",
-        )
+    yield Finding("permission", Verdict.OK, "this user can open it")
+    users, all_inspected = holders(target, system)
+    if users:
+        found = f"open in {', '.join(users)}: each program would receive only a part of the bytes"
+        yield Finding("busy", Verdict.FAIL, found, "stop that program")
     else:
-        yield Finding(
-            "busy",
-            Verdict.OK,
-            "nobody has it open" if all_seen else "none of this user's programs has it open",
-        )
+        whose = "no other program has" if all_inspected else "none of this user's other programs has"
+        yield Finding("busy", Verdict.OK, f"{whose} it open")
 
 
 def candidates(system: System) -> list[Path]:
-    """Serial ports that are there, by their stable names where they have one."""
+    """Return the serial ports of this machine, by their stable names if they have one."""
     named = sorted((system.dev / "serial" / "by-id").glob("*"))
     taken = {path.resolve() for path in named}
     plain = sorted(path for kind in ("ttyUSB*", "ttyACM*") for path in system.dev.glob(kind))
@@ -111,16 +95,16 @@ def candidates(system: System) -> list[Path]:
 
 
 def holders(device: Path, system: System) -> tuple[list[str], bool]:
-    """Other processes that have a device open, and whether all could be looked at."""
+    """Return the other processes that have a device open, and whether all could be inspected."""
     found = []
-    all_seen = True
+    all_inspected = True
     for process in system.proc.glob("[0-9]*"):
         if process.name == str(os.getpid()):
             continue
         try:
             links = [os.readlink(fd) for fd in (process / "fd").iterdir()]
         except PermissionError:
-            all_seen = False
+            all_inspected = False
             continue
         except OSError:
             continue  # it has ended
@@ -129,7 +113,7 @@ def holders(device: Path, system: System) -> tuple[list[str], bool]:
             with suppress(OSError):
                 name = (process / "comm").read_text().strip()
             found.append(f"{name} (process {process.name})")
-    return found, all_seen
+    return found, all_inspected
 
 
 def _group(device: Path) -> str:
@@ -141,71 +125,64 @@ def _group(device: Path) -> str:
 
 
 def interface_step(name: str, system: System) -> Finding:
-    """Examine a CAN interface."""
-    there = system.sys / "class" / "net" / name
-    if not there.exists():
-        others = sorted(path.name for path in there.parent.glob("*can*"))
+    """Check a CAN interface."""
+    interface = system.sys / "class" / "net" / name
+    if not interface.exists():
+        others = sorted(path.name for path in interface.parent.glob("*can*"))
         found = f"there is no CAN interface {name}" + (f", but {', '.join(others)}" if others else "")
-        return Finding("interface", Verdict.FAIL, found, "plug the adapter in, or load its driver")
-    flags = int(_read(there / "flags") or "0", 16)
+        return Finding("interface", Verdict.FAIL, found, "plug in the adapter, or load its driver")
+    flags = int(_read(interface / "flags") or "0", 16)
     if not flags & _IFF_UP:
         fix = f"sudo ip link set {name} up type can bitrate 1000000 (for CAN FD: dbitrate 5000000 fd on)"
         return Finding("interface", Verdict.FAIL, f"{name} is down", fix)
     return Finding(
-        "interface", Verdict.OK, f"{name} is up; `ip -details link show {name}` tells its bit rate"
+        "interface", Verdict.OK, f"{name} is up; `ip -details link show {name}` shows its bit rate"
     )
 
 
 def usb(name: str, system: System) -> Iterator[Finding]:
-    """What an adapter's driver does to latency.
+    """Check the settings of an adapter that add latency.
 
     Parameters
     ----------
     name : str
-        Of the device: ``ttyUSB0``.
+        Name of the device, such as ``ttyUSB0``.
     system : System
-        Where to look.
+        The system.
 
     Yields
     ------
-    Step
+    Finding
         One for each setting that the device has.
     """
     timer = system.sys / "bus" / "usb-serial" / "devices" / name / "latency_timer"
     latency_ms = _read(timer)
-    if latency_ms.isdigit():
-        slow = int(latency_ms) > 1
-        yield Finding(
-            "latency timer",
-            Verdict.WARN if slow else Verdict.OK,
-            f"{latency_ms} ms" + (": samples come in bursts of that length" if slow else ""),
-            f"echo 1 | sudo tee {timer}; for good: install the udev rule {RULES}" if slow else "",
-        )
+    if latency_ms in ("0", "1"):
+        yield Finding("latency timer", Verdict.OK, f"{latency_ms} ms")
+    elif latency_ms:
+        found = f"{latency_ms} ms: samples arrive in bursts of that length"
+        fix = f"echo 1 | sudo tee {timer}; permanently: install the udev rule {RULES}"
+        yield Finding("latency timer", Verdict.WARN, found, fix)
     flags = _read(system.sys / "class" / "tty" / name / "flags")
-    if flags:
-        quick = bool(int(flags, 16) & _LOW_LATENCY)
-        yield Finding(
-            "low latency",
-            Verdict.OK if quick else Verdict.WARN,
-            "set" if quick else "not set: the system may hold bytes back",
-            "" if quick else f"sudo setserial /dev/{name} low_latency",
-        )
+    if flags and int(flags, 16) & _LOW_LATENCY:
+        yield Finding("low latency", Verdict.OK, "set")
+    elif flags:
+        fix = f"sudo setserial /dev/{name} low_latency"
+        yield Finding("low latency", Verdict.WARN, "not set: the driver may delay bytes", fix)
     device = (system.sys / "class" / "tty" / name / "device").resolve()
-    for folder in (device, *device.parents):
-        if (folder / "idVendor").exists():
-            sleeps = _read(folder / "power" / "control") == "auto"
-            control = folder / "power" / "control"
-            yield Finding(
-                "USB autosuspend",
-                Verdict.WARN if sleeps else Verdict.OK,
-                "on: the adapter may fall asleep" if sleeps else "off",
-                f"echo on | sudo tee {control}; for good: install the udev rule {RULES}" if sleeps else "",
-            )
-            return
+    adapter = next((folder for folder in (device, *device.parents) if (folder / "idVendor").exists()), None)
+    if adapter is None:
+        return
+    control = adapter / "power" / "control"
+    if _read(control) == "auto":
+        fix = f"echo on | sudo tee {control}; permanently: install the udev rule {RULES}"
+        yield Finding("USB autosuspend", Verdict.WARN, "on: the adapter may be suspended", fix)
+    else:
+        yield Finding("USB autosuspend", Verdict.OK, "off")
 
 
 def _read(path: Path) -> str:
-    """A small file of the system, or nothing."""
+    """Return the text of a system file; empty if it cannot be read."""
     try:
         return path.read_text().strip()
     except OSError:

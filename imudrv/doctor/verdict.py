@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 
 class Verdict(Enum):
-    """How a step came out."""
+    """Result of a step."""
 
     OK = "ok"
     WARN = "warn"
@@ -13,18 +13,18 @@ class Verdict(Enum):
 
 
 class Finding(NamedTuple):
-    """One step of the examination.
+    """Finding of one step of the examination.
 
     Parameters
     ----------
     name : str
-        What was looked at.
+        What was examined.
     verdict : Verdict
-        `WARN` works, but not well; `FAIL` must be mended.
+        `WARN`: it works, but not well; `FAIL`: it must be fixed.
     found : str
         What was found.
     fix : str
-        What to do, empty where nothing is to be done.
+        What to do; empty if nothing.
     """
 
     name: str
@@ -33,6 +33,6 @@ class Finding(NamedTuple):
     fix: str = ""
 
     def __str__(self) -> str:
-        """One line, and one for what to do."""
+        """One line, and a second one with the fix."""
         fix = f"\n        -> {self.fix}" if self.fix else ""
         return f"{self.verdict.value:>4}  {self.name}: {self.found}{fix}"

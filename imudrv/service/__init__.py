@@ -1,11 +1,16 @@
 """The live service.
 
-loop           read, decode, compensate, publish
-settings       settings file
-status         health of a status
-status_socket  unix socket that reports the status
-runtime        signals, systemd, memory, priority
-latency        latency statistics
-printer        text for people, in the background
-monitor        a running service on the terminal
+loop               read, decode, compensate, publish
+port               supervision of the port
+calibration_watch  replacement of the calibration when its file changes
+recordings         recordings, begun and ended while running
+events             event log
+latency            latency statistics
+runtime            signals, systemd, memory, priority
+warm_up            compilation before the first sample
+settings           settings file
+status             status and health
+status_socket      unix socket that reports the status
+monitor            live view on the terminal
+printer            background output of text
 """

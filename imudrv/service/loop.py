@@ -1,14 +1,12 @@
-"""The live service: the only wiring of ports, decoding, compensation, sinks and recording.
+"""The live service: connects port, decoding, compensation, sinks and recording.
 
-One thread reads, stamps, decodes, compensates and publishes, driven by samples and never by a timer. What the
-system held back arrives as one batch and is handled as one. Whatever else has to be done is done between two
-reads, twenty times a second, in microseconds.
+One thread reads, stamps, decodes, compensates and publishes, driven by samples and not by a timer. What the
+system has held back arrives as one batch and is processed as one. Everything else is done between two reads,
+fifty times a second, in microseconds.
 """
 
 import json
 import os
-import time
-from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack
@@ -16,75 +14,74 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from signal import SIGHUP, SIGINT, SIGTERM
-from threading import Thread
 from typing import Final
 
 import numpy as np
 
 from imudrv import profiles
-from imudrv.calibration import Calibration, coefficients, read_calibration_file
-from imudrv.diagnosis import LineState, LineWatch
-from imudrv.errors import InputError
-from imudrv.files import atomic
+from imudrv.calibration import coefficients
+from imudrv.diagnosis import LineState
 from imudrv.hostclock import now_ns
 from imudrv.imu.rate_filter import rate_filter
 from imudrv.pipeline import Pipeline, PipelineOutput
-from imudrv.ports import Port, PortEndedError, PortLostError, check_url, open_port
-from imudrv.profiles.schema import Profile
-from imudrv.records import INCREMENTS, PULSES, Flag, Source
+from imudrv.ports import PortEndedError
+from imudrv.records import INCREMENTS, PULSES, Arrival, Source
+from imudrv.service.calibration_watch import CalibrationWatch
+from imudrv.service.events import EventLog
 from imudrv.service.latency import Latency
+from imudrv.service.port import PortSupervisor
+from imudrv.service.recordings import Recordings
 from imudrv.service.runtime import SignalFlags, SystemdNotifier, ask_realtime, frozen_gc
 from imudrv.service.settings import Settings, default_status_path
-from imudrv.service.status import Status, health
+from imudrv.service.status import (
+    IncrementStatus,
+    RejectedStatus,
+    SampleStatus,
+    Status,
+    UnitStatus,
+    temperatures,
+)
 from imudrv.service.status_socket import StatusServer
+from imudrv.service.warm_up import warm_up
 from imudrv.sinks import open_sink
 from imudrv.sinks.base import Batch, Sink
 from imudrv.sinks.history import History
 from imudrv.sinks.recorder import Recorder
 from imudrv.units import NS, NS_PER_S
 from imudrv.wire.datagram import encode
-from imudrv.wire.encode import CanEncoder, StreamEncoder
 
 POLL_NS: Final = NS_PER_S // 50
 """Time between two rounds of housekeeping, and the longest wait for data."""
 
 
-BACK_OFF_S: Final = (0.1, 0.2, 0.4, 0.8)
-"""Waits between attempts to open a port again; the last one for ever."""
-
-
-_WARM_UP: Final = 300
-
-
-_SHOWN_EVENTS: Final = 20
-
-
 class Service:
-    """The service between a unit and those who navigate with it.
+    """The service between a unit and the programs that navigate with it.
 
     Parameters
     ----------
     settings : Settings
-        What to do.
+        Settings of `imudrv run`.
     say : callable
-        Told each event in a line; must not block.
+        Called with the line of each event; must not block.
     sinks : sequence of Sink
-        More ways out than the settings have.
+        Sinks in addition to those of the settings.
     warn : callable, optional
         Called instead of `say` with each event that is a failure.
     in_real_time : bool
-        False for a simulated unit at a port, whose rate depends on its speed and is not judged.
+        False for a simulated unit at a hardware port, whose rate depends on its speed and is not checked.
     history : History, optional
         Filled by the loop, for recordings that begin in the past.
-    signals : Signals, optional
-        Given by a caller that handles some signals before `run` does.
+    signals : SignalFlags, optional
+        Those of a caller that handles signals before `run` does.
     notices : callable, optional
         Returns further warnings for the status, a sentence each.
+    clock : callable, optional
+        Returns the host time, ns.
 
     Raises
     ------
     InputError
-        Something in the settings cannot be: all that can be told before the unit is there is told now.
+        A setting is wrong, as far as that can be checked before the unit is connected.
     """
 
     def __init__(
@@ -98,43 +95,33 @@ class Service:
         history: History | None = None,
         signals: SignalFlags | None = None,
         notices: Callable[[], list[str]] = list,
+        clock: Callable[[], int] = now_ns,
     ) -> None:
-        self._settings = settings
-        self._say, self._warn = say, warn or say
-        self._more_notices = notices
+        self._settings, self._clock = settings, clock
+        self._version = version("imu50")  # reads files: not in the loop
         self._profile_file = profiles.load_file(settings.profile)
         self._profile = self._profile_file.model
         self._layout = self._profile.layout()
-        self._calibration_path = Path(settings.calibration)
-        self._calibration_seen = atomic.change_mark(self._calibration_path)
-        self._calibration = read_calibration_file(self._calibration_path, settings.unit)
-        self._calibration_refused = ""
-        self._exchanges = 0
-        check_url(settings.port, self._profile)
-        self._rates = rate_filter(settings.rate_filter, self._layout.interval_ns)
-        self._pipeline = Pipeline(self._profile, coefficients(self._calibration.model), self._rates)
+        self._recordings = Recordings(self._create_recorder, history)
+        self._events = EventLog(say, warn or say, self._recordings.event, clock)
+        self._calibration = CalibrationWatch(Path(settings.calibration), settings.unit, self._events)
+        self._port = PortSupervisor(settings.port, self._profile, in_real_time, self._events, clock)
+        self._pipeline = Pipeline(
+            self._profile,
+            coefficients(self._calibration.current.model),
+            rate_filter(settings.rate_filter, self._layout.interval_ns),
+        )
         self._latency = Latency(self._layout.interval_ns)
         self._signals = signals or SignalFlags()
-        self._history = history
-        self._switches: deque[tuple[Path | None, int | None, Future[None]]] = deque()
-        self._has_ended = False
         self._manager = SystemdNotifier()
         self._notices: list[str] = []
-        self._events: list[str] = []
-        self._port: Port | None = None
-        self._port_state, self._reconnects = LineState("connecting"), 0
-        scheme = settings.port.partition(":")[0]
-        self._source = {"sim": Source.SIMULATOR, "replay": Source.REPLAY}.get(scheme, Source.HARDWARE)
-        self._in_real_time = in_real_time and self._source is Source.HARDWARE
-        self._began_ns = now_ns()
-        self._watch = LineWatch(self._profile, self._in_real_time, self._began_ns)
-        self._samples = self._samples_told = self._lost_told = 0
-        self._told_ns = self._began_ns
-        self._is_news = False
+        self._more_notices = notices
+        self._started_ns = self._rated_ns = clock()
+        self._next_poll_ns = 0
+        self._samples = self._rated_samples = self._rated_lost = 0
         self._rate_hz, self._lost_last_s = 0.0, 0
         self._last_pulses = np.zeros(1, PULSES)
         self._last_increments = np.zeros(1, INCREMENTS)
-        self._line = b""
         with ExitStack() as undo:
             self._sinks = list(sinks)
             for sink in sinks:
@@ -147,24 +134,59 @@ class Service:
                 Path(settings.status) if settings.status else default_status_path()
             )
             undo.callback(self._status_server.close)
-            self._recorder = self._open_recorder(Path(settings.record)) if settings.record else None
+            if settings.record:
+                self._recordings.begin(Path(settings.record))
             self._open = undo.pop_all()
+        self._status = self._assemble_status(self._started_ns)
+        self._status_line = b""
 
     def run(self) -> None:
         """Serve until SIGTERM, Ctrl-C, or the end of a replay."""
         if self._settings.realtime and (refusal := ask_realtime()):
             self._notices.append(refusal)
-            self._failure(refusal)
-        warm_up(self._profile, self._calibration.model, self._settings)
+            self._events.failure(refusal)
+        warm_up(self._profile, self._calibration.current.model, self._settings.rate_filter)
         with self._signals.caught(SIGTERM, SIGINT, SIGHUP), frozen_gc():
             try:
-                self._refresh(now_ns())
-                self._manager.tell("READY=1")
-                self._event(f"serving {self._settings.port}, calibration {self._calibration.sha256[:12]}")
-                self._serve()
+                self._publish_status(self._clock())
+                self._manager.notify("READY=1")
+                sha256 = self._calibration.current.sha256
+                self._events.event(f"serving {self._settings.port}, calibration {sha256[:12]}")
+                while not self._signals.stop and self.step():
+                    pass
             finally:
-                self._manager.tell("STOPPING=1")
-                self._finish()
+                self._manager.notify("STOPPING=1")
+                self.close()
+
+    def step(self) -> bool:
+        """Read once, publish, and do the housekeeping if it is due.
+
+        Returns
+        -------
+        bool
+            False once a replay or a simulation is complete.
+        """
+        self._recordings.switch()
+        try:
+            arrival = self._port.read(POLL_NS * NS)
+        except PortEndedError:
+            return False
+        if arrival is not None:
+            self._process(arrival)
+        now = self._clock()
+        if now >= self._next_poll_ns:
+            self._next_poll_ns = now + POLL_NS
+            self._poll(now)
+        return True
+
+    def close(self) -> None:
+        """Publish the samples that are held back, and close everything; `run` does it."""
+        self._publish(self._pipeline.close(), self._clock())
+        self._port.close()
+        self._events.event(f"end: {self._pipeline.tracker.counts}")
+        self._publish_status(self._clock())
+        self._recordings.close()
+        self._open.close()
 
     def stop(self) -> None:
         """End `run`, as SIGTERM does; for any thread."""
@@ -173,334 +195,134 @@ class Service:
     @property
     def port_state(self) -> LineState:
         """State of the line to the unit; for any thread."""
-        return self._port_state
+        return self._port.state
+
+    @property
+    def status(self) -> Status:
+        """Status as last published; for any thread."""
+        return self._status
 
     def record(self, path: Path | None, since: int | None = None) -> Future[None]:
-        """Record into another file, or into none; for any thread.
+        """Record into another file, or stop recording; for any thread.
 
         Parameters
         ----------
         path : Path or None
-            There must be no such file yet.
+            A file that does not exist yet, or a folder; None stops recording.
         since : int, optional
-            Counter of the sample to begin with, as far back as the history reaches; not given: the next read.
-            The recording before is not shortened: both then have what came meanwhile.
+            Counter of the sample to begin with, as far back as the history reaches; by default the recording
+            begins with the next read. The recording before is not shortened: both then contain the samples
+            from there to the switch.
 
         Returns
         -------
         Future
-            Done when the recording before is closed; the `InputError` where the new one cannot be made.
-            Cancelled when the service ends first: the recording before is closed then, too.
+            Done when the recording before is closed; has the `InputError` if the new one cannot be created.
+            Cancelled if the service ends first, which closes the recording before as well.
         """
-        done: Future[None] = Future()
-        self._switches.append((path, since, done))
-        if self._has_ended:
-            done.cancel()
-        return done
+        return self._recordings.request(path, since)
 
-    def _serve(self) -> None:
-        attempt, next_attempt_ns, next_poll_ns = 0, 0, 0
-        while not self._signals.stop:
-            if self._switches:
-                self._switch_recording()
-            now = now_ns()
-            if self._port is None and now >= next_attempt_ns:
-                if self._connect():
-                    attempt = 0
-                else:
-                    wait_s = BACK_OFF_S[min(attempt, len(BACK_OFF_S) - 1)]
-                    attempt, next_attempt_ns = attempt + 1, now_ns() + round(wait_s * NS_PER_S)
-            if self._port is None:
-                time.sleep(POLL_NS * NS)
-            else:
-                try:
-                    arrival = self._port.read(POLL_NS * NS)
-                except PortLostError as lost:
-                    self._lose(str(lost))
-                    attempt, next_attempt_ns = 0, 0
-                except PortEndedError:
-                    self._port_state = LineState("ended")
-                    return
-                else:
-                    if len(arrival.data):
-                        if self._recorder is not None:
-                            self._recorder.arrived(arrival)
-                        if self._history is not None:
-                            self._history.arrived(arrival)
-                        sampled = self._pipeline.feed(arrival.data, arrival.t_ns)
-                        self._publish(sampled, arrival.t_ns)
-                        self._watch.arrived(len(arrival.data), len(sampled.pulses), now_ns())
-            now = now_ns()
-            if now >= next_poll_ns:
-                next_poll_ns = now + POLL_NS
-                self._poll(now)
+    def _process(self, arrival: Arrival) -> None:
+        self._recordings.arrived(arrival)
+        output = self._pipeline.feed(arrival.data, arrival.t_ns)
+        self._publish(output, arrival.t_ns)
+        self._port.decoded(arrival, len(output.pulses))
 
-    def _publish(self, sampled: PipelineOutput, arrival_ns: int) -> None:
-        pulses, increments = sampled
+    def _publish(self, output: PipelineOutput, arrival_ns: int) -> None:
+        pulses, increments = output
+        if not len(pulses) and not len(increments):
+            return
+        batch = Batch(pulses, increments, encode(increments, self._port.source))
+        for sink in self._sinks:
+            sink.publish(batch)
         if len(pulses):
             self._samples += len(pulses)
             self._last_pulses = pulses
-        elif not len(increments):
-            return
-        batch = Batch(pulses, increments, encode(increments, self._source))
-        for sink in self._sinks:
-            sink.publish(batch)
-        if self._history is not None:
-            self._history.publish(batch)
-        if not len(increments):
-            return
-        if self._source is not Source.REPLAY:
-            self._latency.add(now_ns() - arrival_ns, len(increments))
-        self._last_increments = increments
-        if self._recorder is not None:
-            self._recorder.publish(batch)
-
-    # The port
-
-    def _connect(self) -> bool:
-        try:
-            self._port = open_port(self._settings.port, self._profile)
-        except PortLostError as lost:
-            if str(lost) != self._port_state.trouble:
-                self._failure(f"port not there: {lost}")
-            self._port_state = self._port_state._replace(trouble=str(lost))
-            return False
-        if self._port_state.name == "lost":
-            self._reconnects += 1
-            self._event("port is back")
-        self._port_state = LineState("streaming")
-        self._watch = LineWatch(self._profile, self._in_real_time, now_ns())
-        return True
-
-    def _lose(self, why: str) -> None:
-        assert self._port is not None
-        self._port.close()
-        self._port = None
-        self._port_state = LineState("lost", why)
-        self._failure(str(self._port_state))
-
-    def _look_at_port(self, now: int) -> None:
-        before, self._port_state = self._port_state, self._watch.state(now)
-        if self._port_state == before:
-            return
-        if self._port_state.trouble:
-            self._failure(str(self._port_state))
-        else:
-            self._event("the rate is right again" if before.name == "streaming" else "the unit is back")
-
-    # Housekeeping
+        if len(increments):
+            self._last_increments = increments
+            if self._port.source is not Source.REPLAY:
+                self._latency.add(self._clock() - arrival_ns, len(increments))
+        self._recordings.publish(batch)
 
     def _poll(self, now: int) -> None:
         for sink in self._sinks:
             sink.poll()
-        if self._recorder is not None:
-            self._recorder.poll()
-        if self._port is not None:
-            self._look_at_port(now)
-        self._manager.alive(now)
-        if self._is_news or now - self._told_ns >= NS_PER_S:
-            self._look_at_calibration()
-            self._refresh(now)
-        self._status_server.poll(self._line)
+        self._recordings.poll()
+        self._port.check_line(now)
+        self._manager.feed_watchdog(now)
+        if self._events.is_new or now - self._rated_ns >= NS_PER_S:
+            self._check_calibration(now)
+            self._publish_status(now)
+        self._status_server.poll(self._status_line)
 
-    def _refresh(self, now: int) -> None:
-        """Make the status anew: once a second, and when there is news."""
-        self._is_news = False
-        seconds = (now - self._told_ns) * NS
-        if seconds >= 1.0:
-            counts = self._pipeline.tracker.counts
-            self._rate_hz = (self._samples - self._samples_told) / seconds
-            self._lost_last_s = counts.lost - self._lost_told
-            self._samples_told, self._lost_told, self._told_ns = self._samples, counts.lost, now
-            if self._port is not None:
-                self._watch.counted(counts.expected, now)
-        status = self.status(now)
-        self._line = json.dumps(status).encode() + b"\n"
-        if self._recorder is not None:
-            self._recorder.status(status)
+    def _check_calibration(self, now: int) -> None:
+        if reload := self._signals.reload:
+            self._signals.reload = False  # before the file is read: a later signal has it read again
+        if (new := self._calibration.poll(reload)) is not None:
+            self._pipeline.replace_calibration(coefficients(new.model))
+            self._recordings.calibration(now, new.content)
+            self._events.event(f"calibration replaced: {new.sha256[:12]}")
 
-    def _look_at_calibration(self) -> None:
-        mark = atomic.change_mark(self._calibration_path)
-        if not self._signals.reload and mark == self._calibration_seen:
-            return
-        self._signals.reload = False
-        self._calibration_seen = mark
-        try:
-            calibration = read_calibration_file(self._calibration_path, self._settings.unit)
-        except InputError as error:
-            self._calibration_refused = str(error)
-            self._failure(f"calibration refused, the old one stays: {error}")
-            return
-        self._calibration_refused = ""
-        if calibration.sha256 == self._calibration.sha256:
-            return
-        self._calibration = calibration
-        self._exchanges += 1
-        self._pipeline.exchange(coefficients(calibration.model))
-        if self._recorder is not None:
-            self._recorder.calibration(now_ns(), calibration.content)
-        if self._history is not None:
-            self._history.clear()  # a recording begins with one calibration
-        self._event(f"calibration exchanged: {calibration.sha256[:12]}")
+    def _publish_status(self, now: int) -> None:
+        """Publish the status: once a second, and after each event."""
+        self._events.is_new = False
+        if now - self._rated_ns >= NS_PER_S:
+            self._measure_rate(now)
+        self._status = self._assemble_status(now)
+        document = self._status.to_json()
+        self._status_line = json.dumps(document).encode() + b"\n"
+        self._recordings.status(document)
 
-    def _failure(self, text: str) -> None:
-        self._event(text, self._warn)
+    def _measure_rate(self, now: int) -> None:
+        counts = self._pipeline.tracker.counts
+        self._rate_hz = (self._samples - self._rated_samples) / ((now - self._rated_ns) * NS)
+        self._lost_last_s = counts.lost - self._rated_lost
+        self._rated_samples, self._rated_lost, self._rated_ns = self._samples, counts.lost, now
+        self._port.check_rate(counts.expected, now)
 
-    def _event(self, text: str, say: Callable[[str], None] | None = None) -> None:
-        now = now_ns()
-        self._events = [*self._events[1 - _SHOWN_EVENTS :], f"{_utc(now)} {text}"]
-        self._is_news = True
-        (say or self._say)(self._events[-1])
-        if self._recorder is not None:
-            self._recorder.event(now, text)
+    def _assemble_status(self, now: int) -> Status:
+        calibration, pipeline = self._calibration, self._pipeline
+        pulses = self._last_pulses[-1]
+        return Status(
+            software=self._version,
+            pid=os.getpid(),
+            t_ns=now,
+            uptime_s=(now - self._started_ns) * NS,
+            port=self._port.status,
+            profile=self._profile.name,
+            unit=calibration.current.model.serial_number,
+            calibration=calibration.status,
+            rate_hz=self._rate_hz,
+            nominal_rate_hz=self._profile.sample_rate_hz,
+            samples=SampleStatus(**vars(pipeline.tracker.counts), lost_last_s=self._lost_last_s),
+            rejected={
+                reason.name.lower(): RejectedStatus(entry.runs, entry.length)
+                for reason, entry in sorted(pipeline.decoder.rejected.items())
+            },
+            clock=pipeline.clock.report,
+            latency=self._latency.report,
+            temperature_degc=temperatures(pulses, self._layout),
+            unit_status=UnitStatus.of(int(pulses["status"]), self._layout),
+            sinks=[sink.state for sink in self._sinks],
+            recording=self._recordings.state,
+            last=IncrementStatus.of(self._last_increments[-1]),
+            notices=[
+                *self._notices,
+                *([calibration.refused] if calibration.refused else []),
+                *self._more_notices(),
+            ],
+            events=self._events.lines,
+        )
 
-    def _switch_recording(self) -> None:
-        path, since, done = self._switches.popleft()
-        before, self._recorder = self._recorder, None
-        if path is not None:
-            try:
-                self._recorder = self._open_recorder(path)
-            except InputError as error:
-                done.set_exception(error)
-            else:
-                if since is not None and self._history is not None:
-                    self._recorder.catch_up(self._history.since(since))
-
-        def close() -> None:
-            if before is not None:
-                before.close()
-            if not done.done():
-                done.set_result(None)
-
-        # It waits for the disk, which the loop must not.
-        Thread(target=close, name="recording's end", daemon=True).start()
-
-    def _open_recorder(self, path: Path) -> Recorder:
+    def _create_recorder(self, path: Path) -> Recorder:
         if path.is_dir():
             path = path / f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{os.getpid()}.mcap"
         return Recorder(
             path,
             layout=self._layout,
             profile=self._profile_file.content,
-            calibration=self._calibration.content,
-            source=self._source,
+            calibration=self._calibration.current.content,
+            source=self._port.source,
             port=self._settings.port,
-            unit=self._calibration.model.serial_number,
+            unit=self._calibration.current.model.serial_number,
         )
-
-    def _finish(self) -> None:
-        """Hand on what is held back, and let go of everything."""
-        self._publish(self._pipeline.close(), now_ns())
-        if self._port is not None:
-            self._port.close()
-        self._event(f"end: {self._pipeline.tracker.counts}")
-        self._refresh(now_ns())
-        if self._recorder is not None:
-            self._recorder.close()
-        self._has_ended = True
-        while self._switches:
-            self._switches.popleft()[-1].cancel()
-        self._open.close()
-
-    # What it tells
-
-    def status(self, now: int) -> Status:
-        """Give the status.
-
-        Parameters
-        ----------
-        now : int
-            Host time, ns.
-
-        Returns
-        -------
-        dict
-            Text, numbers, lists and mappings; `health` and `reasons` judge the rest.
-        """
-        counts = self._pipeline.tracker.counts
-        pulses, increments = self._last_pulses[-1], self._last_increments[-1]
-        clock, latency = self._pipeline.clock.report, self._latency.report
-        bits = [name for bit, name in self._layout.status_names if int(pulses["status"]) >> bit & 1]
-        fault = int(pulses["status"]) & self._layout.status.fault
-        faults = [name for bit, name in self._layout.status_names if fault >> bit & 1]
-        status: Status = {
-            "format": "imu50-status",
-            "version": 1,
-            "software": version("imu50"),
-            "pid": os.getpid(),
-            "t_ns": now,
-            "uptime_s": (now - self._began_ns) * NS,
-            "port": {
-                "url": self._settings.port,
-                "state": self._port_state.name,
-                "trouble": self._port_state.trouble,
-                "reconnects": self._reconnects,
-                "source": self._source.name.lower(),
-            },
-            "profile": self._profile.name,
-            "unit": self._calibration.model.serial_number,
-            "calibration": {
-                "path": str(self._calibration_path),
-                "sha256": self._calibration.sha256,
-                "exchanges": self._exchanges,
-                "refused": self._calibration_refused,
-            },
-            "rate_hz": self._rate_hz,
-            "nominal_rate_hz": self._profile.sample_rate_hz,
-            "samples": {
-                **vars(counts),
-                "lost": counts.lost,
-                "lost_last_s": self._lost_last_s,
-                "closes": counts.closes,
-            },
-            "rejected": {
-                reason.name.lower(): {"runs": r.runs, "length": r.length}
-                for reason, r in sorted(self._pipeline.decoder.rejected.items())
-            },
-            "clock": clock._asdict(),
-            "latency": latency._asdict(),
-            "temperature_degc": {
-                name: round(float(t), 3) if np.isfinite(t) else None
-                for name, t in zip(self._layout.temperature_names, pulses["temperature_degc"], strict=False)
-            },
-            "unit_status": {"word": int(pulses["status"]), "bits": bits, "faults": faults},
-            "sinks": [sink.state._asdict() for sink in self._sinks],
-            "recording": self._recorder.state._asdict() if self._recorder is not None else None,
-            "last": {
-                "counter": int(increments["counter"]),
-                "t_ns": int(increments["t_ns"]),
-                "interval_ns": int(increments["interval_ns"]),
-                "dtheta_b": increments["dtheta_b"].tolist(),
-                "dv_b": increments["dv_b"].tolist(),
-                "flags": [flag.name for flag in Flag if flag & int(increments["flags"])],
-            },
-            "notices": [
-                *self._notices,
-                *([self._calibration_refused] if self._calibration_refused else []),
-                *self._more_notices(),
-            ],
-            "events": self._events,
-        }
-        status["health"], status["reasons"] = health(status)
-        return status
-
-
-def warm_up(profile: Profile, calibration: Calibration, settings: Settings) -> None:
-    """Take made-up samples through every stage: nothing is to be compiled or loaded while the unit talks."""
-    layout = profile.layout()
-    pulses = np.zeros(_WARM_UP, PULSES)
-    pulses["counter"] = np.arange(_WARM_UP)
-    pulses["temperature_degc"] = 35.0
-    rates = rate_filter(settings.rate_filter, layout.interval_ns)
-    pipeline = Pipeline(profile, coefficients(calibration), rates)
-    wire = CanEncoder(layout).encode(pulses) if layout.can else StreamEncoder(layout).encode(pulses).tobytes()
-    for at in range(0, len(wire), max(1, len(wire) // 50)):
-        increments = pipeline.feed(wire[at : at + max(1, len(wire) // 50)], at).increments
-        encode(increments, Source.SIMULATOR)
-    pipeline.exchange(coefficients(calibration))
-    pipeline.feed(wire, len(wire))
-    pipeline.close()
-
-
-def _utc(t_ns: int) -> str:
-    return datetime.fromtimestamp(t_ns * NS, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -1,6 +1,6 @@
-"""Text for people from a command that serves a unit: printed by a thread of its own.
+"""Print the text of a command that serves a unit in a thread of its own.
 
-A terminal that is stopped (Ctrl-S), a pipe that nobody reads and a full disk hold or fail that thread alone.
+A stopped terminal (Ctrl-S), a pipe that nobody reads and a full disk then stop only that thread.
 """
 
 import os
@@ -13,11 +13,11 @@ from types import TracebackType
 from typing import Final, Self, TextIO
 
 LIMIT: Final = 1000
-"""Maximum number of lines that wait to be printed."""
+"""Maximum number of lines in the queue."""
 
 
 STOPPED_S: Final = 1.0
-"""An output that has not taken a line after this time is reported as stopped."""
+"""Time after which an output that accepts no text is reported as stopped."""
 
 
 _LAST_S: Final = 1.0
@@ -27,13 +27,13 @@ class Printer:
     """Prints lines in the background.
 
     `say` neither blocks nor raises. The oldest lines of a full queue, and lines that cannot be written, are
-    lost and counted; the output says so once it works again.
+    lost and counted; their number is printed once the output works again.
 
     Parameters
     ----------
     stream : text file or None
-        ``sys.stdout`` or ``sys.stderr``; None, as Python has it in a process that was started with the
-        stream closed: nobody wants the text.
+        ``sys.stdout`` or ``sys.stderr``; None, to which Python sets them in a process started with the
+        stream closed: the text is discarded.
     """
 
     def __init__(self, stream: TextIO | None) -> None:
@@ -52,12 +52,12 @@ class Printer:
         self._thread.start()
 
     def say(self, text: str) -> None:
-        """Print a line, soon.
+        """Queue a line for printing.
 
         Parameters
         ----------
         text : str
-            Without the line break at its end.
+            The line, without a line break at its end.
         """
         while True:
             try:
@@ -70,7 +70,7 @@ class Printer:
 
     @property
     def lost(self) -> int:
-        """Number of lines that were not printed and never will be."""
+        """Number of lines that could not be printed."""
         return self._overflowed + self._unwritten
 
     @property
@@ -79,17 +79,17 @@ class Printer:
         return self._failure and f"{self._name}: cannot be written: {self._failure}; lost lines: {self.lost}"
 
     def notices(self) -> list[str]:
-        """What is wrong with the output now, for the status: one sentence, or none."""
+        """Return what is wrong with the output now, for the status: one sentence, or none."""
         since_s = self._writing_since_s
         if since_s is None or time.monotonic() - since_s < STOPPED_S:
             return [self.failure] if self.failure else []
         return [
-            f"{self._name}: takes no text, is the terminal stopped (Ctrl-S)? "
+            f"{self._name}: accepts no text; is the terminal stopped (Ctrl-S)? "
             f"waiting lines: {self._lines.qsize() + 1}, lost: {self.lost}"
         ]
 
     def close(self) -> None:
-        """Print what waits, for two seconds at most."""
+        """Print the queued lines, for two seconds at most."""
         try:
             self._lines.put(None, timeout=_LAST_S)
         except Full:
@@ -114,13 +114,13 @@ class Printer:
                 reported = lost
 
     def _write(self, data: bytes) -> bool:
-        """Write a line, however long that takes; whether it is out."""
+        """Write a line, however long that takes; return whether it was written."""
         self._writing_since_s = time.monotonic()
         try:
             while data:
                 try:
                     data = data[os.write(self._fd, data) :]
-                except BlockingIOError:  # whoever shares the output has made it non-blocking
+                except BlockingIOError:  # another process has made the shared output non-blocking
                     select.select([], [self._fd], [])
         except OSError as error:
             self._failure = error.strerror or str(error)

@@ -1,4 +1,4 @@
-"""What the service asks of the system: quiet memory, a real-time place, signals, the service manager."""
+"""What the service needs from the system: memory, real-time priority, signals, the service manager."""
 
 import ctypes
 import gc
@@ -19,7 +19,7 @@ _MCL_CURRENT_AND_FUTURE: Final = 3
 
 @contextmanager
 def frozen_gc() -> Iterator[None]:
-    """Keep the garbage collector from stopping the loop: what stands now is kept, nothing is searched."""
+    """Keep the garbage collector from interrupting the loop: existing objects are kept, none is searched."""
     gc.collect()
     gc.freeze()
     gc.disable()
@@ -36,7 +36,7 @@ def ask_realtime() -> str | None:
     Returns
     -------
     str or None
-        Why not, with what to do; None: granted.
+        Why it was refused and what to do; None if it was granted.
     """
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
@@ -53,16 +53,17 @@ def ask_realtime() -> str | None:
 
 
 class SignalFlags:
-    """SIGTERM and SIGINT end the loop, SIGHUP makes it read the calibration again; seen at its next turn.
+    """Signals for the loop, which checks them at each step.
 
-    A SIGHUP because the terminal has gone ends it too: nobody is there any more.
+    SIGTERM and SIGINT end it. SIGHUP makes it read the calibration again, but ends it if the terminal was
+    closed.
 
     Attributes
     ----------
     stop, reload : bool
-        Requested: the end, and that the calibration is read again.
+        Whether to end, and whether to read the calibration again.
     hung_up : bool
-        Whether the end is due to the terminal and not to a request.
+        Whether it ends because the terminal was closed.
     """
 
     def __init__(self) -> None:
@@ -80,7 +81,7 @@ class SignalFlags:
 
     @contextmanager
     def caught(self, *numbers: signal.Signals) -> Iterator[None]:
-        """Handle these while inside."""
+        """Handle these signals within the context."""
         before = {number: signal.signal(number, self._handle) for number in numbers}
         try:
             yield
@@ -90,7 +91,7 @@ class SignalFlags:
 
 
 class SystemdNotifier:
-    """The service manager, where one started us (systemd's notify protocol, sd_notify(3))."""
+    """Notifications to the service manager that started the process, if any: sd_notify(3) of systemd."""
 
     def __init__(self) -> None:
         self._address = os.environ.get("NOTIFY_SOCKET", "").replace("@", "\0", 1)
@@ -98,8 +99,8 @@ class SystemdNotifier:
         self._period_ns = int(period_us) * 1000 // 3 if period_us.isdigit() else 0
         self._next_ns = 0
 
-    def tell(self, message: str) -> None:
-        """Send a message, such as ``READY=1``; a manager that is gone does not matter."""
+    def notify(self, message: str) -> None:
+        """Send a message, such as ``READY=1``; a manager that has ended is ignored."""
         if not self._address:
             return
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as channel:
@@ -108,8 +109,8 @@ class SystemdNotifier:
             except OSError:
                 self._address = ""
 
-    def alive(self, now_ns: int) -> None:
-        """Feed the watchdog three times in its period."""
+    def feed_watchdog(self, now_ns: int) -> None:
+        """Feed the watchdog, three times in its period."""
         if self._period_ns and now_ns >= self._next_ns:
             self._next_ns = now_ns + self._period_ns
-            self.tell("WATCHDOG=1")
+            self.notify("WATCHDOG=1")

@@ -1,4 +1,4 @@
-"""What the live service is told: its settings file, and the same from the command line."""
+"""Settings of the live service: from a file, from the command line, or from both."""
 
 import os
 import tempfile
@@ -21,10 +21,10 @@ FORMAT: Final = "imu50-service"
 class Settings(Model):
     """Settings of `imudrv run`.
 
-    Paths in the file are taken from where the service is started. `unit`: serial number of the connected
-    unit; a calibration of another one is refused. `record` may be a folder: each run then makes a file of its
-    own, named by its time. `status`: the socket that tells the status. `realtime` asks for SCHED_FIFO and
-    locked memory.
+    Paths in the file are relative to the folder in which the service is started. `unit`: serial number of the
+    connected unit; a calibration of another one is refused. `record` may be a folder: each run then creates a
+    file named by its start time. `status`: the socket that reports the status. `realtime` requests SCHED_FIFO
+    and locked memory.
     """
 
     format: Literal["imu50-service"] = "imu50-service"
@@ -41,14 +41,14 @@ class Settings(Model):
 
 
 def load(path: Path | None, given: dict[str, Any]) -> Settings:
-    """Settings of a file, of the command line, or of both.
+    """Return the settings of a file, of the command line, or of both.
 
     Parameters
     ----------
     path : Path or None
-        The settings file.
+        Settings file.
     given : dict
-        What the command line says; None: not given. It goes before the file.
+        Values of the command line; None: not given. They override the file.
 
     Returns
     -------
@@ -57,7 +57,7 @@ def load(path: Path | None, given: dict[str, Any]) -> Settings:
     Raises
     ------
     InputError
-        The file has faults, or something is missing in both.
+        The file has faults, or a required value is missing in both.
     """
     given = {name: value for name, value in given.items() if value is not None}
     if path is not None:
@@ -72,5 +72,5 @@ def load(path: Path | None, given: dict[str, Any]) -> Settings:
 
 
 def default_status_path() -> Path:
-    """Where the status socket is unless told otherwise: in the user's runtime folder."""
+    """Return the default path of the status socket, in the user's runtime folder."""
     return Path(os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()) / "imu50.sock"

@@ -1,54 +1,260 @@
-"""The status of a running service: what it says, and the socket that says it.
+"""Status of a running service, and the health that follows from it."""
 
-A client connects to the unix socket, gets one line of JSON, and the service hangs up.
-"""
+from dataclasses import asdict, dataclass
+from typing import Any, Final, Self
 
-from typing import Any, Final, TypeAlias
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
 
-Status: TypeAlias = dict[str, Any]
-"""As of `imudrv.service.loop.Service.status`: text, numbers, lists and mappings."""
+from imudrv.errors import InputError
+from imudrv.imu.clock import ClockReport
+from imudrv.imu.sequence import SampleCounts
+from imudrv.records import Flag, Records
+from imudrv.service.latency import LatencyReport
+from imudrv.sinks.base import SinkState
+from imudrv.wire.layout import Layout
 
+FORMAT: Final = "imu50-status"
 
-_OK, _WARN, _FAIL = "ok", "warn", "fail"
+VERSION: Final = 1
 
-
-EXIT_CODES: Final = {_OK: 0, _WARN: 3, _FAIL: 4}
+EXIT_CODES: Final = {"ok": 0, "warn": 3, "fail": 4}
 """Exit code of `imudrv status` by health."""
 
 
-def health(status: Status) -> tuple[str, list[str]]:
-    """Judge a status.
+@dataclass(frozen=True)
+class PortStatus:
+    """State of the port.
 
     Parameters
     ----------
-    status : dict
-        Without its `health`.
-
-    Returns
-    -------
-    str
-        ``ok``; ``warn``: samples flow, a person should look; ``fail``: they do not.
-    list of str
-        Why, in plain words.
+    url : str
+        As in the settings.
+    state, trouble : str
+        Fields of `imudrv.diagnosis.LineState`.
+    reconnects : int
+        Number of times that a lost port was opened again.
+    source : str
+        ``hardware``, ``simulator`` or ``replay``.
     """
-    failures, warnings = [], []
-    port = status["port"]
-    if port["state"] not in ("streaming", "ended"):
-        failures.append(f"port {port['state']}: {port['trouble'] or port['url']}")
-    elif port["trouble"]:
-        warnings.append(port["trouble"])
-    if not status["samples"]["closes"]:
-        failures.append("the sample counts do not add up: a defect of this product, please report it")
-    warnings += [f"unit: {name}" for name in status["unit_status"]["faults"]]
-    warnings += [f"{s['url']}: {s['state']}" for s in status["sinks"] if not s["healthy"]]
-    recording = status["recording"]
-    if recording and not recording["healthy"]:
-        failures.append(f"recording {recording['url']}: {recording['state']}")
-    if status["samples"]["lost_last_s"]:
-        warnings.append(f"{status['samples']['lost_last_s']} samples lost in the last second")
-    if port["state"] == "streaming" and not status["clock"]["locked"]:
-        warnings.append("clock not locked yet")
-    warnings += status["notices"]
-    if failures:
-        return _FAIL, failures + warnings
-    return (_WARN, warnings) if warnings else (_OK, [])
+
+    url: str
+    state: str
+    trouble: str
+    reconnects: int
+    source: str
+
+
+@dataclass(frozen=True)
+class CalibrationStatus:
+    """Calibration in use.
+
+    Parameters
+    ----------
+    path : str
+        Calibration file.
+    sha256 : str
+        SHA-256 of the content in use.
+    exchanges : int
+        Number of replacements since the start.
+    refused : str
+        Why the file's present content is not used; empty if it is.
+    """
+
+    path: str
+    sha256: str
+    exchanges: int
+    refused: str
+
+
+@dataclass(frozen=True)
+class SampleStatus(SampleCounts):
+    """Sample counts, with the number of samples lost in the last second."""
+
+    lost_last_s: int
+
+
+@dataclass(frozen=True)
+class RejectedStatus:
+    """Number of runs of input rejected for one reason, and their length, bytes (on CAN: messages)."""
+
+    runs: int
+    length: int
+
+
+@dataclass(frozen=True)
+class UnitStatus:
+    """Status word of the latest sample, and the names of its bits that are set and that mean a fault."""
+
+    word: int
+    bits: list[str]
+    faults: list[str]
+
+    @classmethod
+    def of(cls, word: int, layout: Layout) -> Self:
+        """Name the bits of a status word."""
+        bits = [(1 << bit, name) for bit, name in layout.status_names if word >> bit & 1]
+        return cls(word, [name for _, name in bits], [n for mask, n in bits if mask & layout.status.fault])
+
+
+@dataclass(frozen=True)
+class IncrementStatus:
+    """Latest increment: the fields of `imudrv.records.INCREMENTS`, flags by name."""
+
+    counter: int
+    t_ns: int
+    interval_ns: int
+    dtheta_b: list[float]
+    dv_b: list[float]
+    flags: list[str]
+
+    @classmethod
+    def of(cls, increment: Records) -> Self:
+        """Convert one record."""
+        return cls(
+            counter=int(increment["counter"]),
+            t_ns=int(increment["t_ns"]),
+            interval_ns=int(increment["interval_ns"]),
+            dtheta_b=increment["dtheta_b"].tolist(),
+            dv_b=increment["dv_b"].tolist(),
+            flags=[name for name, flag in Flag.__members__.items() if flag & int(increment["flags"])],
+        )
+
+
+@dataclass(frozen=True)
+class Status:
+    """Status of a service at one time.
+
+    Parameters
+    ----------
+    software : str
+        Version of the product.
+    pid : int
+        Process of the service.
+    t_ns : int
+        Host time, ns.
+    uptime_s : float
+        Time since the start.
+    port : PortStatus
+    profile, unit : str
+        Name of the profile, serial number of the unit.
+    calibration : CalibrationStatus
+    rate_hz, nominal_rate_hz : float
+        Samples per second over the last second, and by the profile.
+    samples : SampleStatus
+    rejected : dict of str to RejectedStatus
+        By reason.
+    clock : ClockReport
+    latency : LatencyReport
+    temperature_degc : dict of str to (float or None)
+        Latest temperatures; None if the unit does not send one.
+    unit_status : UnitStatus
+    sinks : list of SinkState
+    recording : SinkState or None
+        None if nothing is recorded.
+    last : IncrementStatus
+    notices : list of str
+        Further warnings, a sentence each.
+    events : list of str
+        Latest events with their time, oldest first.
+    """
+
+    software: str
+    pid: int
+    t_ns: int
+    uptime_s: float
+    port: PortStatus
+    profile: str
+    unit: str
+    calibration: CalibrationStatus
+    rate_hz: float
+    nominal_rate_hz: float
+    samples: SampleStatus
+    rejected: dict[str, RejectedStatus]
+    clock: ClockReport
+    latency: LatencyReport
+    temperature_degc: dict[str, float | None]
+    unit_status: UnitStatus
+    sinks: list[SinkState]
+    recording: SinkState | None
+    last: IncrementStatus
+    notices: list[str]
+    events: list[str]
+
+    @property
+    def failures(self) -> list[str]:
+        """Reasons why no samples are output or recorded."""
+        failures = []
+        if self.port.state not in ("streaming", "ended"):
+            failures.append(f"port {self.port.state}: {self.port.trouble or self.port.url}")
+        if not self.samples.closes:
+            failures.append("the sample counts do not add up: a defect of this product, please report it")
+        if self.recording and not self.recording.healthy:
+            failures.append(f"recording {self.recording.url}: {self.recording.state}")
+        return failures
+
+    @property
+    def warnings(self) -> list[str]:
+        """What a person should look at although samples are output."""
+        is_streaming = self.port.state == "streaming"
+        warnings = [self.port.trouble] if is_streaming and self.port.trouble else []
+        warnings += [f"unit: {name}" for name in self.unit_status.faults]
+        warnings += [f"{sink.url}: {sink.state}" for sink in self.sinks if not sink.healthy]
+        if self.samples.lost_last_s:
+            warnings.append(f"{self.samples.lost_last_s} samples lost in the last second")
+        if is_streaming and not self.clock.locked:
+            warnings.append("clock not locked yet")
+        return warnings + self.notices
+
+    @property
+    def health(self) -> str:
+        """``fail`` if there are failures, ``warn`` if there are warnings only, else ``ok``."""
+        return "fail" if self.failures else "warn" if self.warnings else "ok"
+
+    @property
+    def reasons(self) -> list[str]:
+        """Reasons of `health`, failures first."""
+        return self.failures + self.warnings
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the JSON document of the status socket and of recordings."""
+        samples = asdict(self.samples) | {"lost": self.samples.lost, "closes": self.samples.closes}
+        return {
+            "format": FORMAT,
+            "version": VERSION,
+            **asdict(self),
+            "samples": samples,
+            "clock": self.clock._asdict(),
+            "latency": self.latency._asdict(),
+            "sinks": [sink._asdict() for sink in self.sinks],
+            "recording": self.recording._asdict() if self.recording else None,
+            "health": self.health,
+            "reasons": self.reasons,
+        }
+
+    @classmethod
+    def from_json(cls, document: dict[str, Any]) -> "Status":
+        """Return the status of a JSON document.
+
+        Raises
+        ------
+        InputError
+            The document does not come from a service of this version.
+        """
+        try:
+            return _ADAPTER.validate_python(document)
+        except ValidationError as error:
+            fault = error.errors()[0]
+            raise InputError(
+                f"status: {'.'.join(map(str, fault['loc']))}: {fault['msg']}; "
+                "restart the service if it runs another version of imudrv than this command"
+            ) from error
+
+
+_ADAPTER: Final = TypeAdapter(Status)
+
+
+def temperatures(pulses: Records, layout: Layout) -> dict[str, float | None]:
+    """Return the temperatures of one sample by name, degC rounded to 0.001; None if not sent."""
+    degc = zip(layout.temperature_names, pulses["temperature_degc"].tolist(), strict=False)
+    return {name: round(t, 3) if np.isfinite(t) else None for name, t in degc}

@@ -9,30 +9,29 @@ import socket
 import stat
 from contextlib import suppress
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from imudrv.errors import InputError
-from imudrv.service.status import Status
+from imudrv.service.status import FORMAT
 
 MAX_STATUS: Final = 1 << 20
-"""Largest status that a client takes, bytes."""
-
+"""Largest status that a client accepts, bytes."""
 
 TIMEOUT_S: Final = 2.0
 
 
 class StatusServer:
-    """Listens on a unix socket that only the user can open; never blocks.
+    """Unix socket that only its user can open; never blocks.
 
     Parameters
     ----------
     path : Path
-        The socket. One that a dead service left is replaced.
+        Path of the socket. One left by a service that has died is replaced.
 
     Raises
     ------
     InputError
-        Another service is there, or the socket cannot be made.
+        Another service listens there, or the socket cannot be created.
     """
 
     def __init__(self, path: Path) -> None:
@@ -55,17 +54,17 @@ class StatusServer:
                 os.umask(before)
         except OSError as error:
             self._socket.close()
-            raise InputError(f"{path}: cannot make the status socket: {error.strerror or error}") from error
+            raise InputError(f"{path}: cannot create the status socket: {error.strerror or error}") from error
         self._socket.listen(8)
         self._socket.setblocking(False)
 
     def poll(self, line: bytes) -> None:
-        """Tell whoever has connected.
+        """Send the status to the clients that have connected.
 
         Parameters
         ----------
         line : bytes
-            The status now; whole lines of JSON.
+            Status as one line of JSON.
         """
         while True:
             try:
@@ -73,18 +72,18 @@ class StatusServer:
             except OSError:
                 return
             with client, suppress(OSError):
-                # Larger than any status, so that it goes out at once whoever reads.
+                # Larger than any status, so that sending never waits for the client.
                 client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MAX_STATUS)
                 client.setblocking(False)
                 client.sendall(line)
 
     def close(self) -> None:
-        """Stop listening and take the socket away."""
+        """Stop listening and remove the socket."""
         self._socket.close()
         self.path.unlink(missing_ok=True)
 
 
-def ask(path: Path) -> Status:
+def ask(path: Path) -> dict[str, Any]:
     """Ask a service for its status.
 
     Parameters
@@ -95,11 +94,12 @@ def ask(path: Path) -> Status:
     Returns
     -------
     dict
+        JSON document, see `imudrv.service.status.Status.from_json`.
 
     Raises
     ------
     InputError
-        Nobody is there, or what is there is no service of ours.
+        No service listens there, or what answers is not a service of this product.
     """
     data = bytearray()
     try:
@@ -117,6 +117,6 @@ def ask(path: Path) -> Status:
         status = json.loads(data)
     except ValueError:
         status = None
-    if not isinstance(status, dict) or status.get("format") != "imu50-status":
+    if not isinstance(status, dict) or status.get("format") != FORMAT:
         raise InputError(f"{path}: expected the status of a service, got {bytes(data[:40])!r}")
     return status

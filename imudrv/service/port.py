@@ -1,0 +1,151 @@
+"""Supervision of the port: open it, open it again after a loss, watch what the line brings."""
+
+import time
+from collections.abc import Callable
+from typing import Final
+
+from imudrv.diagnosis import LineState, LineWatch
+from imudrv.ports import Port, PortEndedError, PortLostError, check_url, open_port
+from imudrv.profiles.schema import Profile
+from imudrv.records import Arrival, Source
+from imudrv.service.events import EventLog
+from imudrv.service.status import PortStatus
+from imudrv.units import NS_PER_S
+
+BACK_OFF_S: Final = (0.1, 0.2, 0.4, 0.8)
+"""Delays before further attempts to open the port; the last one is repeated."""
+
+_SOURCES: Final = {"sim": Source.SIMULATOR, "replay": Source.REPLAY}
+
+
+class PortSupervisor:
+    """A port that is opened again whenever it is lost.
+
+    Parameters
+    ----------
+    url : str
+        As for `imudrv.ports.open_port`.
+    profile : Profile
+        Profile of the unit.
+    in_real_time : bool
+        Whether hardware at this port sends at its own pace; otherwise its rate is not checked.
+    events : EventLog
+        Receives losses and recoveries.
+    clock : callable
+        Returns the host time, ns.
+
+    Attributes
+    ----------
+    state : LineState
+        State of the line to the unit.
+    source : Source
+        Kind of device behind the port.
+
+    Raises
+    ------
+    InputError
+        The URL is wrong, or does not fit the profile.
+    """
+
+    def __init__(
+        self, url: str, profile: Profile, in_real_time: bool, events: EventLog, clock: Callable[[], int]
+    ) -> None:
+        check_url(url, profile)
+        self._url, self._profile = url, profile
+        self._events, self._clock = events, clock
+        self.source = _SOURCES.get(url.partition(":")[0], Source.HARDWARE)
+        self._in_real_time = in_real_time and self.source is Source.HARDWARE
+        self.state = LineState("connecting")
+        self._port: Port | None = None
+        self._watch = LineWatch(profile, self._in_real_time, clock())
+        self._reconnects = 0
+        self._attempts, self._next_attempt_ns = 0, 0
+
+    @property
+    def status(self) -> PortStatus:
+        """Current status of the port."""
+        return PortStatus(self._url, *self.state, self._reconnects, self.source.name.lower())
+
+    def read(self, timeout_s: float) -> Arrival | None:
+        """Wait for data.
+
+        Parameters
+        ----------
+        timeout_s : float
+            Longest wait.
+
+        Returns
+        -------
+        Arrival or None
+            None if nothing has arrived or the port is not open.
+
+        Raises
+        ------
+        PortEndedError
+            The replay or the simulation is complete.
+        """
+        port = self._port or self._connect()
+        if port is None:
+            time.sleep(timeout_s)
+            return None
+        try:
+            arrival = port.read(timeout_s)
+        except PortLostError as lost:
+            self.close()
+            self.state = LineState("lost", str(lost))
+            self._events.failure(str(self.state))
+            return None
+        except PortEndedError:
+            self.state = LineState("ended")
+            raise
+        return arrival if len(arrival.data) else None
+
+    def decoded(self, arrival: Arrival, samples: int) -> None:
+        """Take note of the number of samples that an arrival completed."""
+        self._watch.arrived(len(arrival.data), samples, self._clock())
+
+    def check_rate(self, expected: int, now_ns: int) -> None:
+        """Check the rate; call it about once a second with the number of samples by the unit's counter."""
+        if self._port is not None:
+            self._watch.counted(expected, now_ns)
+
+    def check_line(self, now_ns: int) -> None:
+        """Report a line that has become silent, unreadable or good again."""
+        if self._port is None:
+            return
+        before, self.state = self.state, self._watch.state(now_ns)
+        if self.state == before:
+            return
+        if self.state.trouble:
+            self._events.failure(str(self.state))
+        elif before.name == "streaming":
+            self._events.event("the rate is right again")
+        else:
+            self._events.event("the unit is back")
+
+    def close(self) -> None:
+        """Close the port if it is open."""
+        if self._port is not None:
+            self._port.close()
+            self._port = None
+
+    def _connect(self) -> Port | None:
+        if self._clock() < self._next_attempt_ns:
+            return None
+        try:
+            self._port = open_port(self._url, self._profile)
+        except PortLostError as lost:
+            delay_s = BACK_OFF_S[min(self._attempts, len(BACK_OFF_S) - 1)]
+            self._attempts += 1
+            self._next_attempt_ns = self._clock() + round(delay_s * NS_PER_S)
+            if str(lost) != self.state.trouble:
+                self._events.failure(f"port not available: {lost}")
+            self.state = self.state._replace(trouble=str(lost))
+            return None
+        self._attempts = 0
+        if self.state.name == "lost":
+            self._reconnects += 1
+            self._events.event("port is back")
+        self.state = LineState("streaming")
+        self._watch = LineWatch(self._profile, self._in_real_time, self._clock())
+        return self._port
