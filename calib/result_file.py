@@ -177,8 +177,8 @@ def _profile(run: Run) -> dict[str, Any]:
         "peak_deg_per_s": rotation.peak_deg_per_s,
         "axis_tilt_deg": rotation.axis_tilt_deg,
         "missing_samples": rotation.missing,
-        "rest_before_s": None if rotation.before is None else rotation.before.duration_s,
-        "rest_after_s": None if rotation.after is None else rotation.after.duration_s,
+        "rest_before_s": rotation.before.duration_s,
+        "rest_after_s": rotation.after.duration_s,
         "alignment": {
             "duration_s": aligned.duration_s,
             "heading_deg": aligned.heading_rad / DEG,

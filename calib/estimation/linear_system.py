@@ -167,19 +167,18 @@ def rest_noise(runs: Sequence[Run]) -> Noise:
         (run.label.rpartition("#")[0], rest.start): rest
         for run in runs
         for rest in (run.rotation.before, run.rotation.after)
-        if rest is not None
     }
     found = vars(pooled_noise(rest.differences for rest in rests.values()))
     return Noise(**{name: max(value, getattr(LEAST_NOISE, name)) for name, value in found.items()})
 
 
-def bin_variance(rest: Rest | None, noise: Noise) -> float:
+def bin_variance(rest: Rest, noise: Noise) -> float:
     """What a bin's mean varies by beside the random walk to its middle.
 
     White noise is a rest's own where that is much more: a level accelerometer with a pulse a second or less
     does not average out in a bin. The mean of a random walk varies less than its value in the middle.
     """
-    own = rest.noise.velocity_white if rest is not None and rest.noise is not None else 0.0
+    own = rest.noise.velocity_white if rest.noise is not None else 0.0
     white = own if own > OWN_RATIO * noise.velocity_white else noise.velocity_white
     return white**2 - noise.velocity_walk**2 * BIN_S / 6.0
 

@@ -24,8 +24,10 @@ from typing import Final, Literal, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
+from calib.html_table import html_table
 from imudrv.arrays import Array
 from imudrv.errors import InputError
+from imudrv.units import MM
 
 Gauge: TypeAlias = Literal["centroid", "x", "y", "z", "given"]
 
@@ -41,23 +43,38 @@ _WEIGHTS: Final = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class LeverArms:
-    """The sensing points in a gauge.
+    """The sensing points of the accelerometers in a gauge.
 
     Attributes
     ----------
     r_b : ndarray, shape (3, 3)
         Row i: sensing point of accelerometer i, m, body axes.
     covariance : ndarray, shape (9, 9), or None
-        Of (r_x, r_y, r_z) in the gauge, m^2; None: not known.
+        Covariance of (r_x, r_y, r_z) in the gauge, m^2; None: unknown.
     gauge : {'centroid', 'x', 'y', 'z', 'given'}
-        Where the origin of b is.
+        Position of the origin of b.
     """
 
     r_b: Array
     covariance: Array | None
     gauge: Gauge
+
+    def __repr__(self) -> str:
+        points = ", ".join(
+            f"r_{axis} ({', '.join(f'{value:+.3f}' for value in r)})"
+            for axis, r in zip("xyz", self.r_b / MM, strict=True)
+        )
+        return f"<LeverArms: gauge {self.gauge}, mm: {points}>"
+
+    def _repr_html_(self) -> str:
+        cells = [f"{value:+.3f}" for value in self.r_b.ravel() / MM]
+        if self.covariance is not None:
+            sigma = np.sqrt(np.diag(self.covariance)) / MM
+            cells = [f"{cell} ± {s:.3f}" for cell, s in zip(cells, sigma, strict=True)]
+        rows = [(f"r_{axis}", *cells[3 * k : 3 * k + 3]) for k, axis in enumerate("xyz")]
+        return html_table(f"Lever arms, gauge {self.gauge}", ("mm", "X", "Y", "Z"), rows)
 
 
 def convert(

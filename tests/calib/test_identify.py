@@ -18,7 +18,7 @@ from calib.estimation.joint import estimate_joint
 from calib.estimation.plain import estimate_plain
 from calib.estimation.predict import PlannedRotation, predict
 from calib.estimation.result import CENTROID_BASIS, TO_DIFFERENCES, LeverArmEstimate
-from calib.estimation.runs import Priors, Run, navigate_rotations
+from calib.estimation.runs import NavigationOptions, Priors, Run, navigate_rotations
 from imudrv import profiles
 from imudrv.calibration import coefficients, read_calibration
 from imudrv.capture import Capture
@@ -77,7 +77,7 @@ def captured(reference: Path) -> tuple[list[Run], Array]:
             compensator = Compensator(known, capture.layout, rate_filter("causal", interval_ns))
             return capture.increments(compensator, lambda _: None)
 
-        runs += navigate_rotations(read, known.C_ba, site, label=name).runs
+        runs += navigate_rotations(read, known.C_ba, site, name).runs
     r_mm = yaml.safe_load((reference / "truth.yaml").read_text())["r_mm"]
     return runs, np.array([r_mm[axis] for axis in "xyz"]) * MM
 
@@ -446,7 +446,8 @@ def test_a_turntable_run_gives_all_nine_with_every_other_error(positions: Record
     # quarter turns about level axes, 10 deg/s
     limits = RotationLimits(angle_tolerance_deg=np.inf, least_peak_deg_per_s=0.0, axis_tilt_deg=90.0)
     site = Site(latitude_deg=34.0, longitude_deg=0.0, height_m=0.0)
-    runs = navigate_rotations(lambda: [positions], np.eye(3), site, limits=limits, priors=priors).runs
+    options = NavigationOptions(limits, priors)
+    runs = navigate_rotations(lambda: [positions], np.eye(3), site, options=options).runs
     assert len(runs) == 18
     found = estimate_joint(runs, priors, pivot="fixed", nine=True, extra=("quadratic",))
     truth = -np.array([[10.0, 20.0, 30.0], [40.0, 50.0, 60.0], [0.0, 0.0, 0.0]]) * MM

@@ -4,7 +4,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.estimation.runs import AFTER_S, BEFORE_S, CaptureRuns, navigate_rotations
+from calib.estimation.runs import AFTER_S, BEFORE_S, CaptureRuns, NavigationOptions, navigate_rotations
 from imudrv.errors import InputError
 from imudrv.records import Records
 from imudrv.site import Site
@@ -15,7 +15,7 @@ Step = Callable[..., Any]
 
 def evidence(data: Records, site: Site, pieces: int = 5, **options: Any) -> CaptureRuns:
     return navigate_rotations(
-        lambda: np.array_split(data, pieces), np.eye(3), site, label="capture", **options
+        lambda: np.array_split(data, pieces), np.eye(3), site, "capture", NavigationOptions(**options)
     )
 
 

@@ -91,7 +91,7 @@ def test_missing_samples_and_flags_in_the_rotation_are_told(bench: Bench, step: 
     assert rejection_reasons(only(find_segments([kept])), LIMITS) == (
         "3 samples missing during the rotation, want 0 at most",
         "an axis saturated during the rotation",
-        "the unit told a fault during the rotation",
+        "the unit reported a fault during the rotation",
     )
 
 
