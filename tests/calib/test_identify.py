@@ -1,9 +1,6 @@
-import importlib.util
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -19,6 +16,7 @@ from calib.estimation.plain import estimate_plain
 from calib.estimation.predict import PlannedRotation, predict
 from calib.estimation.result import CENTROID_BASIS, TO_DIFFERENCES, LeverArmEstimate
 from calib.estimation.runs import NavigationOptions, Priors, Run, navigate_rotations
+from calib.validation import montecarlo
 from imudrv import profiles
 from imudrv.calibration import coefficients, read_calibration
 from imudrv.capture import Capture
@@ -42,20 +40,7 @@ LATITUDE = 28.2 * DEG
 
 
 @pytest.fixture(scope="module")
-def montecarlo() -> ModuleType:
-    """The script of that name."""
-    path = Path(__file__).parents[2] / "tools" / "montecarlo.py"
-    spec = importlib.util.spec_from_file_location("montecarlo", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["montecarlo"] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
-
-
-@pytest.fixture(scope="module")
-def simulated(montecarlo: ModuleType) -> tuple[list[Run], Array]:
+def simulated() -> tuple[list[Run], Array]:
     """Six rotations of a unit, and its true arms."""
     runs, truth = montecarlo.case(5, (1, -1), montecarlo.BUDGETS["standard"])
     return runs, truth
@@ -212,11 +197,11 @@ def test_correlations_are_correlations(simulated: tuple[list[Run], Array]) -> No
     ("signs", "skew_s", "limit_mm"), [((1,), 0.0, 0.03), ((1,), 0.5e-3, 0.05), ((1, -1), 0.5e-3, 0.015)]
 )
 def test_many_units_are_found_as_well_as_predicted(
-    montecarlo: ModuleType, signs: tuple[int, ...], skew_s: float, limit_mm: float
+    signs: tuple[int, ...], skew_s: float, limit_mm: float
 ) -> None:
     cases = 12 if len(signs) == 1 else 8
     budget = replace(montecarlo.BUDGETS["standard"], priors=Priors(skew=skew_s))
-    of_joint, of_plain = montecarlo.montecarlo(range(100, 100 + cases), signs, budget)
+    of_joint, of_plain = montecarlo.run_cases(range(100, 100 + cases), signs, budget)
     assert of_joint.mean_rms_mm < limit_mm  # the requirement
     assert of_plain.mean_rms_mm > 5.0 * of_joint.mean_rms_mm
     for found in (of_joint, of_plain):
@@ -232,9 +217,9 @@ def test_many_units_are_found_as_well_as_predicted(
 
 
 @pytest.mark.parametrize("budget", ["bias", "misalignment", "slow", "tilted", "offset", "arw"])
-def test_a_harder_budget_widens_the_prediction_with_the_error(montecarlo: ModuleType, budget: str) -> None:
+def test_a_harder_budget_widens_the_prediction_with_the_error(budget: str) -> None:
     cases = 4
-    found, _ = montecarlo.montecarlo(range(200, 200 + cases), (1,), montecarlo.BUDGETS[budget])
+    found, _ = montecarlo.run_cases(range(200, 200 + cases), (1,), montecarlo.BUDGETS[budget])
     low, high = chi2.ppf([0.0005, 0.9995], 6 * cases) / cases
     assert low < found.nees < high
     least_mm = {"slow": 0.025, "arw": 0.017}.get(budget, 0.012)  # standard: 0.016
@@ -243,7 +228,7 @@ def test_a_harder_budget_widens_the_prediction_with_the_error(montecarlo: Module
 
 @pytest.mark.parametrize(("signs", "sigmas"), [((1,), 4.0), ((1, -1), 3.0)])
 def test_a_skew_of_one_sample_is_within_the_uncertainty(
-    montecarlo: ModuleType, monkeypatch: pytest.MonkeyPatch, signs: tuple[int, ...], sigmas: float
+    monkeypatch: pytest.MonkeyPatch, signs: tuple[int, ...], sigmas: float
 ) -> None:
     scenario = montecarlo.scenario
 
@@ -264,7 +249,7 @@ def test_a_skew_of_one_sample_is_within_the_uncertainty(
     assert worst[0.0] > sigmas  # as it was without the parameter
 
 
-def shaken(montecarlo: ModuleType, amplitude_arcsec: float, frequency_hz: float) -> tuple[list[Run], Array]:
+def shaken(amplitude_arcsec: float, frequency_hz: float) -> tuple[list[Run], Array]:
     """Three rotations of a unit that leaves its dither in the increments."""
     a, f = amplitude_arcsec, frequency_hz
     dither = Dither(amplitude_arcsec=(a, a, a), frequency_hz=(f - 9.0, f, f + 11.0), in_increments=1.0)
@@ -281,10 +266,8 @@ def shaken(montecarlo: ModuleType, amplitude_arcsec: float, frequency_hz: float)
 
 
 @pytest.mark.parametrize("amplitude_arcsec", [3.0, 100.0])
-def test_dither_of_the_blocks_left_in_the_increments_does_no_harm(
-    montecarlo: ModuleType, amplitude_arcsec: float
-) -> None:
-    runs, truth = shaken(montecarlo, amplitude_arcsec, 400.0)
+def test_dither_of_the_blocks_left_in_the_increments_does_no_harm(amplitude_arcsec: float) -> None:
+    runs, truth = shaken(amplitude_arcsec, 400.0)
     found = estimate_joint(runs)
     assert found.refusals == ()
     error = found.differences.ravel() - TO_DIFFERENCES @ truth.ravel()
@@ -292,12 +275,10 @@ def test_dither_of_the_blocks_left_in_the_increments_does_no_harm(
     assert np.abs(error / found.differences_sigma.ravel()).max() < 3.0
 
 
-def test_a_shaking_that_the_filter_passes_is_refused(
-    montecarlo: ModuleType, simulated: tuple[list[Run], Array]
-) -> None:
+def test_a_shaking_that_the_filter_passes_is_refused(simulated: tuple[list[Run], Array]) -> None:
     assert estimate_joint(simulated[0]).refusals == ()
     assert max(run.H_rest for run in estimate_joint(simulated[0]).runs) < 5e-4  # a quarter of the limit
-    runs, _ = shaken(montecarlo, 3.0, 150.0)
+    runs, _ = shaken(3.0, 150.0)
     for found in (estimate_joint(runs), estimate_plain(runs)):
         assert len(found.refusals) == 1
         assert found.refusals[0].startswith("the gyro increments carry dither or vibration")
@@ -361,7 +342,7 @@ def test_the_direction_that_a_plan_does_not_see_is_named() -> None:
 
 
 @pytest.fixture(scope="module")
-def turntable(montecarlo: ModuleType) -> Callable[..., tuple[list[Run], Array]]:
+def turntable() -> Callable[..., tuple[list[Run], Array]]:
     """Three rotations whose fixed point lies so far from the origin of b, and the true arms."""
 
     def make(pivot_mm: float, seed: int = 3) -> tuple[list[Run], Array]:
@@ -401,7 +382,7 @@ def test_what_the_data_cannot_tell_is_said(simulated: tuple[list[Run], Array]) -
     assert estimate_joint(simulated[0]).notes == ()
 
 
-def test_a_skew_is_seen_with_a_known_pivot(montecarlo: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_skew_is_seen_with_a_known_pivot(monkeypatch: pytest.MonkeyPatch) -> None:
     scenario = montecarlo.scenario
 
     def skewed(*arguments: Any) -> Any:
