@@ -111,7 +111,7 @@ class CaptureSummary:
         SHA-256 of the file.
     profile : str
         Name of the wire format.
-    books : str
+    counts : str
         Sample counts and losses, in one line.
     temperatures : tuple of Temperature
         Range of each channel that the unit reported.
@@ -125,7 +125,7 @@ class CaptureSummary:
     name: str
     sha256: str
     profile: str
-    books: str
+    counts: str
     temperatures: tuple[Temperature, ...]
     evidence: CaptureRuns
     channel: str | None = None
@@ -269,7 +269,7 @@ def identify(
     runs = [run for source in sources for run in source.evidence.runs]
     if not runs:
         raise InputError(
-            "\n  ".join(["expected one usable rotation at least, got none:", *_rejections(sources)])
+            "\n  ".join(["expected at least one usable rotation, got none:", *_rejections(sources)])
         )
     priors = shared.options.priors
     try:

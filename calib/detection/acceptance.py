@@ -92,7 +92,7 @@ def rejection_reasons(
         )
     if r.axis_tilt_deg > limits.axis_tilt_deg:
         reasons.append(
-            f"axis {r.axis_tilt_deg:.1f} deg off the vertical, want {limits.axis_tilt_deg:g} at most"
+            f"axis {r.axis_tilt_deg:.1f} deg off the vertical, want at most {limits.axis_tilt_deg:g}"
         )
     if r.peak_deg_per_s < limits.least_peak_deg_per_s:
         error = ""
@@ -102,7 +102,7 @@ def rejection_reasons(
             f"peak {r.peak_deg_per_s:.0f} deg/s: slower than {limits.least_peak_deg_per_s:g}{error}"
         )
     if r.missing > limits.missing:
-        reasons.append(f"{r.missing} samples missing during the rotation, want {limits.missing} at most")
+        reasons.append(f"{r.missing} samples missing during the rotation, want at most {limits.missing}")
     for flag, what in ((Flag.SATURATED, "an axis saturated"), (Flag.FAULT, "the unit reported a fault")):
         if r.flags & flag:
             reasons.append(f"{what} during the rotation")

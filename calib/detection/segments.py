@@ -228,7 +228,7 @@ class Segmenter:
         blocks = np.concatenate(self._blocks) if self._blocks else np.zeros(0, BLOCK)
         if len(blocks) * BLOCK_NS * NS < 2.0 * QUIET_S:
             raise InputError(
-                f"segments: expected a capture of {2.0 * QUIET_S:g} s at least, got "
+                f"segments: expected a capture of at least {2.0 * QUIET_S:g} s, got "
                 f"{len(blocks) * BLOCK_NS * NS:.1f} s"
             )
         size, end = self._samples_a_block, self._last + 1

@@ -112,7 +112,7 @@ def predict(
     """
     priors = priors or Priors()
     if not plan:
-        raise InputError("plan: expected one rotation at least, got none")
+        raise InputError("plan: expected at least one rotation, got none")
     runs = [_planned_run(planned, k, latitude_rad, priors) for k, planned in enumerate(plan)]
     terms = parameter_groups(priors, ())
     system = NormalEquations(
@@ -134,8 +134,8 @@ def _planned_run(planned: PlannedRotation, k: int, latitude_rad: float, priors: 
     up_b -= [planned.up == f"-{a}" for a in "XYZ"]
     if not up_b.any() or n < 1 or after * T < GAIN_WINDOW_S:
         raise InputError(
-            f"plan: expected an axis up from +X to -Z, a duration, and a rest of "
-            f"{GAIN_WINDOW_S:g} s at least, got {planned}"
+            f"plan: expected an axis up from +X to -Z, a duration, and a rest of at "
+            f"least {GAIN_WINDOW_S:g} s, got {planned}"
         )
     u = np.clip((np.arange(before + n + after + 1) - before) / n, 0.0, 1.0)
     angle = planned.angle_deg * DEG * u**3 * (10.0 - 15.0 * u + 6.0 * u * u)

@@ -259,7 +259,7 @@ def test_the_plain_method_and_a_gauge_by_name(here: Path, capsys: pytest.Capture
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ([*CAPTURES, "--gauge", "given"], "nine components of the lever arms were asked for"),
+        ([*CAPTURES, "--gauge", "given"], "expected a fixed pivot for nine components of the lever arms"),
         ([*CAPTURES, "--at", "y=1,2,3"], "--at: expected with --gauge given"),
         (
             [*CAPTURES, "--gauge", "given", "--at", "w=1,2,3"],
@@ -315,7 +315,7 @@ def test_a_gauge_is_converted_from_file_to_file_and_back(
     assert back["size_effect"] == {"r_mm": TRUTH_MM, "gauge": "centroid"}
     assert back["provenance"]["inner_lever_arms_gauge"]["from"] == "given"
     assert main(["gauge", "unit.yaml", "--to", "given", "-o", "nine.yaml"]) == 2
-    assert "expected where one sensing point is" in capsys.readouterr().err
+    assert "expected the position of one sensing point" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("program", ["kalibr", "psins"])

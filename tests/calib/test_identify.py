@@ -86,7 +86,7 @@ def test_joint_finds_the_arms_of_the_reference_captures(captured: tuple[list[Run
     assert rms_mm(found, truth) < 0.05  # the requirement; the predicted sigma is 0.012
     assert found.rank == 6
     # one direction is that in which a skew of the size of its prior acts, the unit 0.1 m off the axis
-    assert found.reason.startswith("rank 6: the directions seen have a sigma of 0.1")
+    assert found.reason.startswith("rank 6: the observable directions have a sigma of at most 0.1")
     assert found.direction_sigma[4] < 0.03 * MM
     assert found.direction_sigma[6] > 1.0
     error = found.differences.ravel() - TO_DIFFERENCES @ truth.ravel()
@@ -138,7 +138,7 @@ def test_a_common_shift_is_the_only_thing_that_six_rotations_do_not_see(
 
 
 def test_nine_components_without_a_known_pivot_are_refused(simulated: tuple[list[Run], Array]) -> None:
-    assert "a common shift of the three sensing points leaves no velocity at rest" in refused(
+    assert "a common shift of the three sensing points causes no velocity at rest" in refused(
         simulated[0], nine=True
     )
 
@@ -148,13 +148,13 @@ def test_rotations_about_too_few_axes_are_refused_with_the_directions_unseen(
 ) -> None:
     runs = simulated[0]
     message = refused(runs[:2])
-    assert "expected rotations that see 6 directions of the lever arms, got 4" in message
+    assert "expected rotations that determine 6 directions of the lever arms, got 4" in message
     assert "add rotations with another axis up" in message
     # one axis, both signs: what its lean of 3 mrad shows of a third direction is too little
     assert "got 2" in refused([runs[0], runs[3]])
     with pytest.raises(InputError, match="got 4"):
         estimate_plain(runs[:2])
-    assert "expected one good rotation at least, got none" in refused([])
+    assert "expected at least one accepted rotation, got none" in refused([])
 
 
 def test_without_one_of_three_rotations_there_is_no_result_without_one_of_six_nearly_the_same(
@@ -313,14 +313,14 @@ def test_slower_rotations_and_fewer_predict_more() -> None:
 @pytest.mark.parametrize(
     ("plan", "message"),
     [
-        ([], "expected one rotation at least, got none"),
+        ([], "expected at least one rotation, got none"),
         (
             THREE[:2],
-            "expected rotations that see 6 directions of the lever arms, got 4; not seen to 3 mm: .*_",
+            "rotations that determine 6 directions of the lever arms, got 4; unobservable to 3 mm: .*_",
         ),
-        ((THREE[0],) * 3, "got 2; not seen"),
+        ((THREE[0],) * 3, "got 2; unobservable"),
         ((replace(THREE[0], up="up"),), r"expected an axis up from \+X to -Z"),
-        ((replace(THREE[0], after_s=0.1),), "a rest of 0.5 s at least"),
+        ((replace(THREE[0], after_s=0.1),), "a rest of at least 0.5 s"),
     ],
 )
 def test_a_plan_that_cannot_do_is_refused(plan: Sequence[PlannedRotation], message: str) -> None:
@@ -335,7 +335,7 @@ def test_the_direction_that_a_plan_does_not_see_is_named() -> None:
     told = str(caught.value)
     assert "x_Z" in told
     assert "z_X" in told
-    assert "Y" not in told.split("not seen")[1].split("add")[0]  # what lies along Y is seen
+    assert "Y" not in told.split("unobservable")[1].split("add")[0]  # what lies along Y is observable
 
 
 # --- a known pivot, and more unknowns ---
@@ -393,7 +393,7 @@ def test_a_skew_is_seen_with_a_known_pivot(monkeypatch: pytest.MonkeyPatch) -> N
     runs, truth = montecarlo.case(3, (1,), replace(montecarlo.BUDGETS["standard"], pivot_mm=0.0))
     found = estimate_joint(runs, Priors(skew=5e-3), pivot="fixed")
     skew = next(n for n in found.parameters if n.name == "skew_s")
-    assert skew.seen
+    assert skew.observable
     assert skew.value == pytest.approx(3e-3, abs=4.0 * skew.sigma)
     assert skew.sigma < 0.6e-3
     error = (found.R_b - truth).ravel()

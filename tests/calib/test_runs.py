@@ -110,5 +110,5 @@ def test_gravity_is_the_sites_own(bench: Bench, step: Step, site: Site) -> None:
 
 
 def test_a_capture_too_short_is_refused(bench: Bench, step: Step, site: Site) -> None:
-    with pytest.raises(InputError, match="expected a capture of 2 s at least"):
+    with pytest.raises(InputError, match="expected a capture of at least 2 s"):
         evidence(bench(step(1.0)), site)
