@@ -1,29 +1,73 @@
-"""Finds where the accelerometers of the unit that `imudrv` drives sense: its inner lever arms.
+"""Inner lever arms of the IMU that `imudrv` drives: where its three accelerometers sense.
 
-The flow, one way; every module can be read alone::
+In a notebook::
 
-    increments -> Segments -> Run, Run, ... -> Identification -> Arms
-              segments    runs            identify           gauge
+    import calib
 
-    segments   rest, rotation, orientation, found in the data; what cannot serve, with reasons
-    runs       each rotation that serves: aligned, navigated, with its measurement matrices
-    identify   `joint` (all that the rests tell), `plain` (the literature's V = H R), `predict` (before a run)
-    gauge      where the origin is put, and how other programs count
+    calib.predict("three-rotations", site="site.yaml")
+    result = calib.identify(["z.raw", "x.raw", "y.raw"], calibration="unit.yaml", site="site.yaml",
+                            profile="imu50-rs422")
+    calib.validate("z.raw", calibration="unit.yaml", site="site.yaml", profile="imu50-rs422")
 
-    findings   captures to an identification, with all that a report wants to know
-    certificate  the calibration that follows      report, plots, document  what people read
+Data flow; every module can be read alone::
 
-The bench procedure, with a technician::
+    increments -> Segments -> Run, Run, ... -> LeverArmEstimate -> LeverArms
+              detection    estimation      estimation         lever_arms
 
-    procedure  what is to be done, as data         rehearsal  a simulated technician who does it
-    engine     the state machine: samples and keys in, events and a view out. motion is its senses, preflight
-               its first look, prompts its words, events what it says
-    console    the view on a terminal (letters: large ones)
-    session    the evidence of a session: journal, recordings, result; resume and verify
-    conduct    engine, session and screen together, beside the service      bench  `calib run`
+    detection       rests and rotations in increments, offline and live
+    estimation      rotations aligned and navigated; lever arms from their velocities; accuracy of a plan
+    lever_arms      gauges, and the formats of other programs
+    identification  captures to an identification result
+    result_file     the result as JSON      certificate  the result as a calibration file
 
-And afterwards: `validate` judges compensation on a motion, `trials` makes the literature's four on simulated
-units, `dither` says what dithering gyros do.
+    procedure       the bench procedure as data, and its state machine
+    bench           a session with an operator: journal, recordings, screen
+    validation      navigation with and without compensation, on recordings and simulated units
+    dither          effect of gyro dither on the size effect
+    reports         reports as text, for a terminal and as HTML
+    api             functions for a notebook      cli  the command `calib`
 
-Increments are compensated for all but the size effect. The conventions are those of `imudrv`.
+Increments are compensated for everything except the size effect. The conventions are those of `imudrv`.
 """
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from calib.api import load_procedure, predict, validate
+    from calib.bench.session import Session
+    from calib.estimation.predict import PlannedRotation
+    from calib.identification import EstimationOptions, identify
+    from calib.lever_arms.gauge import LeverArms
+
+__all__ = [
+    "EstimationOptions",
+    "LeverArms",
+    "PlannedRotation",
+    "Session",
+    "identify",
+    "load_procedure",
+    "predict",
+    "validate",
+]
+
+_MODULES: Final = {
+    "EstimationOptions": "calib.identification",
+    "LeverArms": "calib.lever_arms.gauge",
+    "PlannedRotation": "calib.estimation.predict",
+    "Session": "calib.bench.session",
+    "identify": "calib.identification",
+    "load_procedure": "calib.api",
+    "predict": "calib.api",
+    "validate": "calib.api",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _MODULES:
+        return getattr(import_module(_MODULES[name]), name)
+    raise AttributeError(f"module 'calib' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return __all__

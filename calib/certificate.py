@@ -1,4 +1,4 @@
-"""Findings as files: the unit's new certificate, and the whole result for programs."""
+"""The calibration file of a unit with its lever arms."""
 
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -16,40 +16,40 @@ from imudrv.errors import FaultyFileError, InputError
 from imudrv.units import MM
 
 PROVENANCE_IDENTIFIED: Final = "inner_lever_arms"
-"""Where the provenance says how they were found."""
+"""Key in the provenance: how the lever arms were identified."""
 
 
 PROVENANCE_CONVERTED: Final = "inner_lever_arms_gauge"
-"""Where it says from which file their gauge was converted."""
+"""Key in the provenance: from which file their gauge was converted."""
 
 
 _R_DECIMALS: Final = 6
-"""Of the sensing points in the certificate, mm: a nanometre."""
+"""Decimals of the sensing points in the certificate, mm: a nanometre."""
 
 
 _COVARIANCE_DECIMALS: Final = 9
-"""Of their covariance, mm^2."""
+"""Decimals of their covariance, mm^2."""
 
 
 def certificate(findings: IdentificationResult, arms: LeverArms) -> Calibration:
-    """Make the unit's new certificate: its calibration, with the arms and how they were found.
+    """Return the new certificate of the unit: its calibration with the lever arms and their provenance.
 
     Parameters
     ----------
-    findings : Findings
-        What was found.
-    arms : Arms
-        The lever arms in the gauge that is wanted.
+    findings : IdentificationResult
+        The result.
+    arms : LeverArms
+        The lever arms in the desired gauge.
 
     Returns
     -------
     Calibration
-        All else is as it was; so is the rest of its provenance.
+        Everything else is unchanged, including the rest of its provenance.
 
     Raises
     ------
     InputError
-        The result is one that nothing may be certified on, see `LeverArmEstimate.refusals`.
+        The result does not allow a certificate, see `LeverArmEstimate.refusals`.
     """
     result = findings.result
     if result.refusals:
@@ -61,20 +61,20 @@ def certificate(findings: IdentificationResult, arms: LeverArms) -> Calibration:
 def with_lever_arms(
     calibration: Calibration, arms: LeverArms, key: str, how: dict[str, Any], when: datetime | None = None
 ) -> Calibration:
-    """Put lever arms into a calibration.
+    """Return a calibration with lever arms.
 
     Parameters
     ----------
     calibration : Calibration
-        Of the unit.
-    arms : Arms
-        Kept to a nanometre.
-    key : {FOUND, CHANGED}
-        Under which the provenance says how.
+        Calibration of the unit.
+    arms : LeverArms
+        Rounded to a nanometre.
+    key : {PROVENANCE_IDENTIFIED, PROVENANCE_CONVERTED}
+        Key of the entry in the provenance.
     how : dict
-        What it says.
+        The entry.
     when : datetime, optional
-        Date of the new calibration; now, if absent.
+        Date of the new calibration; default: now.
 
     Returns
     -------
@@ -103,23 +103,23 @@ def with_lever_arms(
 
 
 def lever_arms_of(calibration: Calibration, name: str) -> LeverArms:
-    """Take the lever arms out of a calibration.
+    """Return the lever arms of a calibration.
 
     Parameters
     ----------
     calibration : Calibration
-        Of the unit.
+        Calibration of the unit.
     name : str
-        What messages call it.
+        Name of the calibration in messages.
 
     Returns
     -------
-    Arms
+    LeverArms
 
     Raises
     ------
     InputError
-        It has none.
+        The calibration has no lever arms.
     """
     effect = calibration.size_effect
     if effect is None:
@@ -130,19 +130,19 @@ def lever_arms_of(calibration: Calibration, name: str) -> LeverArms:
 
 
 def check_target(path: Path, calibration: Calibration) -> None:
-    """Make sure that a certificate may be written to a file.
+    """Check that a certificate may be written to a file.
 
     Parameters
     ----------
     path : Path
-        Where.
+        The file.
     calibration : Calibration
-        Of the unit.
+        Calibration of the unit.
 
     Raises
     ------
     InputError
-        There is the certificate of another unit, or another kind of file.
+        The file is the certificate of another unit, or of another kind.
     """
     if not path.exists():
         return
@@ -156,29 +156,29 @@ def check_target(path: Path, calibration: Calibration) -> None:
 
 
 def write(path: Path, calibration: Calibration) -> None:
-    """Write a certificate; the one that was there is kept under its date.
+    """Write a certificate; an existing one is kept under its date.
 
     Parameters
     ----------
     path : Path
-        Where.
+        The file.
     calibration : Calibration
-        Of the unit.
+        Calibration of the unit.
 
     Raises
     ------
     InputError
-        See `check_target`; or it cannot be written.
+        See `check_target`; or the file cannot be written.
     """
     check_target(path, calibration)
     write_calibration(path, calibration)
 
 
 def software() -> str:
-    """Name and version of what computes."""
+    """Return name and version of the software."""
     return f"imu50 {version('imu50')}"
 
 
 def _row(values: Array) -> Any:
-    """A row as the models of files have it."""
+    """Return a row as the file models take it."""
     return tuple(values.tolist())

@@ -1,11 +1,14 @@
-"""From capture files to findings: what was found, and all that it was made of.
+"""Identify the lever arms from captures; the result with everything that it was computed from.
 
-Certificate and report are functions of `IdentificationResult`; nothing is computed a second time behind it.
+Certificate and report are functions of `IdentificationResult` and compute nothing again.
 """
 
+import hashlib
+import os
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime
+from html import escape
 from importlib.metadata import version
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -16,31 +19,69 @@ from calib.detection.acceptance import RotationLimits
 from calib.estimation.joint import estimate_joint
 from calib.estimation.plain import estimate_plain
 from calib.estimation.result import TO_DIFFERENCES, Extra, LeverArmEstimate, RunResult
-from calib.estimation.runs import CaptureRuns, Priors, Run, navigate_rotations
+from calib.estimation.runs import CaptureRuns, NavigationOptions, Priors, Run, navigate_rotations
+from calib.inputs import StrPath, profile_of, site_of
 from calib.lever_arms.gauge import LeverArms
 from imudrv.arrays import Array
-from imudrv.calibration import Calibration, coefficients
+from imudrv.calibration import Calibration, coefficients, read_calibration_file
 from imudrv.capture import Capture
 from imudrv.errors import InputError
+from imudrv.files import settings_file
 from imudrv.files.atomic import sha256, unchanged
 from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import rate_filter
 from imudrv.profiles.schema import Profile
+from imudrv.recording.reader import Recording
 from imudrv.records import Records
 from imudrv.site import Site
+from imudrv.units import MM
+
+
+@dataclass(frozen=True)
+class EstimationOptions:
+    """Choice of the estimator.
+
+    Attributes
+    ----------
+    method : {'joint', 'plain'}
+        `joint` uses the velocity of the rests before and after; `plain` solves `V = H R`.
+    pivot : {'free', 'fixed'}
+        `fixed`: the origin of b is known to stay still while the unit turns.
+    nine : bool
+        Whether all nine components are required; needs a fixed pivot.
+    extra : tuple of {'quadratic'}
+        Additional parameters to estimate.
+
+    Raises
+    ------
+    InputError
+        Method `plain` with another option.
+    """
+
+    method: Literal["joint", "plain"] = "joint"
+    pivot: Literal["free", "fixed"] = "free"
+    nine: bool = False
+    extra: tuple[Extra, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.method == "plain" and (self.pivot == "fixed" or self.nine or self.extra):
+            raise InputError(
+                "method plain: expected neither a known pivot, nor nine components, nor more unknowns: it "
+                "solves V = H R and nothing else; use method joint"
+            )
 
 
 class PriorCalibration(NamedTuple):
-    """The calibration that the increments were made with.
+    """Calibration that the increments were computed with.
 
     Attributes
     ----------
     calibration : Calibration
-        Its size effect, if there is one, was not used.
+        Its size effect, if it has one, is not used.
     name : str
-        Where it came from.
+        Name of its file or recording.
     sha256 : str
-        Of its file.
+        SHA-256 of its content.
     """
 
     calibration: Calibration
@@ -49,7 +90,7 @@ class PriorCalibration(NamedTuple):
 
 
 class Temperature(NamedTuple):
-    """A channel's range over a capture, degrees Celsius."""
+    """Temperature range of a channel over a capture, degrees Celsius."""
 
     channel: str
     least_degc: float
@@ -58,60 +99,60 @@ class Temperature(NamedTuple):
 
 @dataclass(frozen=True)
 class CaptureSummary:
-    """A capture and what was in it.
+    """A capture and its rotations.
 
     Attributes
     ----------
     label : str
-        How its runs are called.
+        Prefix of the labels of its runs.
     name : str
-        Of the file.
+        File name.
     sha256 : str
-        Of the file.
+        SHA-256 of the file.
     profile : str
-        What the unit sent.
-    books : str
-        Where every sample went, in one line.
+        Name of the wire format.
+    counts : str
+        Sample counts and losses, in one line.
     temperatures : tuple of Temperature
-        Of the channels that were heard.
-    evidence : Evidence
+        Range of each channel that the unit reported.
+    evidence : CaptureRuns
         Rests, rotations, runs.
     channel : str or None
-        The CAN channel that was chosen of a candump log.
+        CAN channel that was read from a candump log.
     """
 
     label: str
     name: str
     sha256: str
     profile: str
-    books: str
+    counts: str
     temperatures: tuple[Temperature, ...]
     evidence: CaptureRuns
     channel: str | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class IdentificationResult:
-    """What a session found.
+    """Result of an identification.
 
     Attributes
     ----------
-    result : Identification
+    result : LeverArmEstimate
         The estimate.
-    basis : Basis
-        The calibration that it continues.
+    basis : PriorCalibration
+        The calibration that it extends.
     site : Site
-        Where the unit stood.
-    limits : Limits
-        What a rotation had to keep.
+        Place of the unit.
+    limits : RotationLimits
+        Limits of an accepted rotation.
     priors : Priors
-        What was taken to be known before.
-    sources : tuple of Source
+        Uncertainty of the static calibration.
+    sources : tuple of CaptureSummary
         The captures.
     created : datetime
-        When, UTC.
+        Time of the identification, UTC.
     software : str
-        What computed it.
+        Name and version of the software.
     """
 
     result: LeverArmEstimate
@@ -123,6 +164,22 @@ class IdentificationResult:
     created: datetime
     software: str
 
+    def __repr__(self) -> str:
+        return f"<IdentificationResult: {self._summary}>"
+
+    def _repr_html_(self) -> str:
+        return f"<p>{escape(self._summary)}</p>{self.arms._repr_html_()}"
+
+    @property
+    def _summary(self) -> str:
+        result, n = self.result, len(self.result.runs)
+        verdict = "; ".join(result.refusals) or "usable for a certificate"
+        return (
+            f"unit {self.basis.calibration.serial_number}, method {result.method}, "
+            f"{n} rotation{'s' if n > 1 else ''}, rank {result.rank}, sigma of the differences up to "
+            f"{result.differences_sigma.max() / MM:.3f} mm: {verdict}"
+        )
+
     @property
     def arms(self) -> LeverArms:
         """The lever arms in the gauge of the estimate."""
@@ -130,7 +187,7 @@ class IdentificationResult:
 
     @property
     def differences_correlation(self) -> Array:
-        """Correlation of the six differences with the nuisances, shape (6, n)."""
+        """Correlation of the six differences with the parameters other than R, shape (6, n)."""
         result = self.result
         covariance = TO_DIFFERENCES @ (result.sigma.reshape(9, 1) * result.correlation)
         correlation: Array = covariance / result.differences_sigma.reshape(6, 1)
@@ -143,24 +200,21 @@ class IdentificationResult:
 
 
 def scatter(run: RunResult) -> float:
-    """Scatter of a run's residuals, rms about their mean, m/s.
+    """Return the scatter of a run's velocity residuals, rms about their mean, m/s.
 
-    Their mean is that of the first velocity, which the pulses leave uncertain.
+    The mean is the error of the first velocity, which the pulses leave uncertain.
     """
-    left = run.v_n - run.fitted_n
-    return float(np.sqrt(np.mean((left - left.mean(axis=0)) ** 2)))
+    residual = run.v_n - run.fitted_n
+    return float(np.sqrt(np.mean((residual - residual.mean(axis=0)) ** 2)))
 
 
-def identify_captures(
-    captures: Sequence[Path],
-    profile: Profile | None,
-    basis: PriorCalibration,
-    site: Site,
+def identify(
+    captures: StrPath | Sequence[StrPath],
     *,
-    method: Literal["joint", "plain"] = "joint",
-    pivot: Literal["free", "fixed"] = "free",
-    nine: bool = False,
-    extra: Sequence[Extra] = (),
+    site: StrPath | Site,
+    calibration: StrPath | PriorCalibration | None = None,
+    profile: StrPath | Profile | None = None,
+    options: EstimationOptions | None = None,
     channel: str | None = None,
     advance: Callable[[int], None] = lambda _: None,
 ) -> IdentificationResult:
@@ -168,41 +222,46 @@ def identify_captures(
 
     Parameters
     ----------
-    captures : sequence of Path
+    captures : path-like or sequence of path-like
         Wire bytes, candump logs or recordings.
-    profile : Profile or None
-        What the unit sends; recordings know it.
-    basis : Basis
-        The unit's calibration; its size effect is not used.
-    site : Site
-        Where the unit stands.
-    method, pivot, nine, extra
-        See `calib.estimation.estimate_joint.estimate_joint`; `estimate_plain` knows no others.
-    channel : str or None
-        The CAN channel to read, of candump logs; needed where a log has several.
+    site : path-like or Site
+        Place of the unit.
+    calibration : path-like or PriorCalibration, optional
+        Calibration of the unit, whose size effect is not used. Recordings contain one.
+    profile : path-like or Profile, optional
+        Wire format: a shipped profile's name or a file. Recordings contain it.
+    options : EstimationOptions, optional
+        Method, pivot and additional parameters.
+    channel : str, optional
+        CAN channel of candump logs; required where a log has several.
     advance : callable
-        Told the number of bytes read, of twice their sum.
+        Called with the number of bytes read; each capture is read twice.
 
     Returns
     -------
-    Findings
+    IdentificationResult
 
     Raises
     ------
     InputError
-        A capture cannot be read or is given twice; no rotation serves, with the reasons; or what
-        `estimate_joint` and `estimate_plain` refuse.
+        A file cannot be read, a capture is given twice, no rotation is usable (with the reasons), or the
+        rotations do not determine the lever arms.
     """
-    if method == "plain" and (pivot == "fixed" or nine or extra):
-        raise InputError(
-            "method plain: expected neither a known pivot, nor nine components, nor more unknowns: it solves "
-            "V = H R and nothing else; use method joint"
-        )
-    limits, priors = RotationLimits(), Priors()
+    options = options or EstimationOptions()
+    paths = _paths(captures)
+    if not isinstance(calibration, PriorCalibration):
+        calibration = prior_calibration(paths, calibration)
+    shared = _Shared(
+        calibration.calibration.without_size_effect(),
+        site_of(site),
+        profile_of(profile),
+        channel,
+        NavigationOptions(),
+        advance,
+    )
     sources: list[CaptureSummary] = []
-    for path in captures:
-        label = _label(path, [source.label for source in sources])
-        source = _read(path, label, profile, channel, basis.calibration, site, limits, priors, advance)
+    for path in paths:
+        source = _read(path, _label(path, [source.label for source in sources]), shared)
         for other in sources:
             if other.sha256 == source.sha256:
                 raise InputError(f"{path}: expected another capture, got that of {other.name} once more")
@@ -210,20 +269,18 @@ def identify_captures(
     runs = [run for source in sources for run in source.evidence.runs]
     if not runs:
         raise InputError(
-            "\n  ".join(["expected one usable rotation at least, got none:", *_rejections(sources)])
+            "\n  ".join(["expected at least one usable rotation, got none:", *_rejections(sources)])
         )
+    priors = shared.options.priors
     try:
-        if method == "plain":
-            result = estimate_plain(runs, priors)
-        else:
-            result = estimate_joint(runs, priors, pivot=pivot, nine=nine, extra=extra)
+        result = _estimate(runs, priors, options)
     except InputError as error:
         raise InputError("\n  ".join([str(error), *_rejections(sources)])) from None
     return IdentificationResult(
         result,
-        basis,
-        site,
-        limits,
+        calibration,
+        shared.site,
+        shared.options.limits,
         priors,
         tuple(sources),
         datetime.now(UTC).replace(microsecond=0),
@@ -231,8 +288,79 @@ def identify_captures(
     )
 
 
+def prior_calibration(
+    captures: Sequence[StrPath], calibration: StrPath | None = None, unit: str | None = None
+) -> PriorCalibration:
+    """Read the calibration of the unit: from its file, or the one that all recordings contain.
+
+    Parameters
+    ----------
+    captures : sequence of path-like
+        Captures, searched for a calibration where no file is given.
+    calibration : path-like, optional
+        Calibration file.
+    unit : str, optional
+        Serial number that the calibration must have.
+
+    Returns
+    -------
+    PriorCalibration
+
+    Raises
+    ------
+    InputError
+        The file cannot be read; a capture contains no calibration, or recordings contain different ones; or
+        it is the calibration of another unit.
+    """
+    if calibration is not None:
+        file = read_calibration_file(calibration, unit)
+        return PriorCalibration(file.model, Path(calibration).name, file.sha256)
+    texts: dict[str, Path] = {}
+    for path in map(Path, captures):
+        text = Recording(path).calibration_text if path.suffix == ".mcap" else None
+        if text is None:
+            raise InputError(f"{path}: expected a calibration, got a capture without one; use --calibration")
+        texts.setdefault(text, path)
+    if len(texts) > 1:
+        raise InputError(
+            "expected recordings made with one calibration, got different ones in "
+            f"{' and '.join(map(str, texts.values()))}; choose one with --calibration"
+        )
+    for text, path in texts.items():
+        model = settings_file.parse_text(text.encode(), Calibration, f"{path}: calibration")
+        if unit not in (None, model.serial_number):
+            raise InputError(
+                f"{path}: expected a recording of unit {unit!r}, got one of {model.serial_number!r}"
+            )
+        return PriorCalibration(
+            model, f"calibration in {path.name}", hashlib.sha256(text.encode()).hexdigest()
+        )
+    raise InputError("captures: expected one file at least, got none")
+
+
+class _Shared(NamedTuple):
+    """What all captures have in common."""
+
+    calibration: Calibration
+    site: Site
+    profile: Profile | None
+    channel: str | None
+    options: NavigationOptions
+    advance: Callable[[int], None]
+
+
+def _paths(captures: StrPath | Sequence[StrPath]) -> list[Path]:
+    return [Path(captures)] if isinstance(captures, str | os.PathLike) else [Path(path) for path in captures]
+
+
+def _estimate(runs: Sequence[Run], priors: Priors, options: EstimationOptions) -> LeverArmEstimate:
+    if options.method == "joint":
+        return estimate_joint(runs, priors, pivot=options.pivot, nine=options.nine, extra=options.extra)
+    return estimate_plain(runs, priors)
+
+
 def _label(path: Path, taken: Sequence[str]) -> str:
-    """The file's name without its suffix, with a number where that is taken."""
+    """Return the file's name without suffix, numbered where that name is taken."""
     label, n = path.stem, 1
     while label in taken:
         n += 1
@@ -240,28 +368,18 @@ def _label(path: Path, taken: Sequence[str]) -> str:
     return label
 
 
-def _read(
-    path: Path,
-    label: str,
-    profile: Profile | None,
-    channel: str | None,
-    calibration: Calibration,
-    site: Site,
-    limits: RotationLimits,
-    priors: Priors,
-    advance: Callable[[int], None],
-) -> CaptureSummary:
-    """Take a capture through both passes, with its books and temperatures."""
-    known = replace(coefficients(calibration), r_b=None)
-    capture = Capture(path, profile, channel)
+def _read(path: Path, label: str, shared: _Shared) -> CaptureSummary:
+    """Find and navigate the rotations of a capture, with its sample counts and temperatures."""
+    known = coefficients(shared.calibration)
+    capture = Capture(path, shared.profile, shared.channel)
     low, high = np.full(6, np.inf), np.full(6, -np.inf)
 
     def increments() -> Iterator[Records]:
         nonlocal capture
-        capture = Capture(path, profile, channel)
+        capture = Capture(path, shared.profile, shared.channel)
         layout = capture.layout
         compensator = Compensator(known, layout, rate_filter("causal", layout.interval_ns))
-        for pulses in capture.pulses(advance):
+        for pulses in capture.pulses(shared.advance):
             if len(pulses):
                 np.fmin(low, np.fmin.reduce(pulses["temperature_degc"], axis=0), out=low)
                 np.fmax(high, np.fmax.reduce(pulses["temperature_degc"], axis=0), out=high)
@@ -270,9 +388,7 @@ def _read(
 
     try:
         with unchanged(path):  # two passes, and one for the hash
-            evidence = navigate_rotations(
-                increments, known.C_ba, site, label=label, limits=limits, priors=priors
-            )
+            evidence = navigate_rotations(increments, known.C_ba, shared.site, label, shared.options)
             digest = sha256(path)
     except InputError as error:
         raise error if str(path) in str(error) else InputError(f"{path}: {error}") from None
@@ -289,12 +405,12 @@ def _read(
             if least <= most
         ),
         evidence,
-        channel,
+        shared.channel,
     )
 
 
 def _rejections(sources: Sequence[CaptureSummary]) -> list[str]:
-    """Why motions did not serve, a line each; a line for a capture without any."""
+    """Return why each motion was rejected, one line each; one line for a capture without motion."""
     lines = []
     for source in sources:
         if not source.evidence.segments.rotations:

@@ -21,14 +21,14 @@ VERSION: Final = 1
 
 
 def result_document(findings: IdentificationResult, arms: LeverArms) -> dict[str, Any]:
-    """Put the whole result into plain data, units in the names.
+    """Return the whole result as plain data, with units in the names.
 
     Parameters
     ----------
-    findings : Findings
-        What was found.
-    arms : Arms
-        The lever arms in the gauge that is wanted.
+    findings : IdentificationResult
+        The result.
+    arms : LeverArms
+        The lever arms in the desired gauge.
 
     Returns
     -------
@@ -58,7 +58,13 @@ def result_document(findings: IdentificationResult, arms: LeverArms) -> dict[str
             "velocity_pulse_m_s": result.noise.velocity_pulse,
         },
         "nuisances_si": [
-            {"name": n.name, "value": n.value, "sigma": n.sigma, "prior_sigma": n.prior, "seen": n.seen}
+            {
+                "name": n.name,
+                "value": n.value,
+                "sigma": n.sigma,
+                "prior_sigma": n.prior,
+                "observable": n.observable,
+            }
             for n in result.parameters
         ],
         "correlation_of_r_with_nuisances": result.correlation.tolist(),
@@ -74,40 +80,40 @@ def result_document(findings: IdentificationResult, arms: LeverArms) -> dict[str
         "runs": [
             {
                 **_profile(run),
-                "V_n_m_s": told.V_n.tolist(),
-                "H_n_m_s_per_m": told.H.tolist(),
-                "V_n_minus_H_R_m_s": told.compensated_n.tolist(),
-                "H_rest_m_s_per_m": told.H_rest,
-                "t_s": told.t_s.tolist(),
-                "v_n_m_s": told.v_n.tolist(),
-                "fitted_n_m_s": told.fitted_n.tolist(),
+                "V_n_m_s": outcome.V_n.tolist(),
+                "H_n_m_s_per_m": outcome.H.tolist(),
+                "V_n_minus_H_R_m_s": outcome.compensated_n.tolist(),
+                "H_rest_m_s_per_m": outcome.H_rest,
+                "t_s": outcome.t_s.tolist(),
+                "v_n_m_s": outcome.v_n.tolist(),
+                "fitted_n_m_s": outcome.fitted_n.tolist(),
             }
-            for run, told in zip(findings.runs, result.runs, strict=True)
+            for run, outcome in zip(findings.runs, result.runs, strict=True)
         ],
     }
 
 
 def write_json(path: Path, document: dict[str, Any]) -> None:
-    """Write plain data as JSON; the file appears whole.
+    """Write plain data as JSON, atomically.
 
     Parameters
     ----------
     path : Path
-        Where.
+        The file.
     document : dict
-        What `result_document` gives.
+        From `result_document`.
 
     Raises
     ------
     InputError
-        It cannot be written.
+        The file cannot be written.
     """
     with atomic_write(path) as file:
         file.write(json.dumps(document, indent=1, allow_nan=False).encode() + b"\n")
 
 
 def inputs_document(findings: IdentificationResult) -> dict[str, Any]:
-    """What the findings rest on."""
+    """Return the inputs of an identification."""
     basis = findings.basis
     return {
         "calibration": {"name": basis.name, "sha256": basis.sha256},
@@ -126,7 +132,7 @@ def _capture(source: CaptureSummary) -> dict[str, Any]:
         "profile": source.profile,
         **({} if source.channel is None else {"channel": source.channel}),
         "duration_s": evidence.segments.duration_s,
-        "samples": source.books,
+        "samples": source.counts,
         "temperature_degc": {t.channel: [t.least_degc, t.most_degc] for t in source.temperatures},
         "runs": [run.label for run in evidence.runs],
         "rejected": [
@@ -151,7 +157,7 @@ def _priors(priors: Priors) -> dict[str, float]:
 
 
 def outcome_document(result: LeverArmEstimate) -> dict[str, Any]:
-    """The figures that a reader of the certificate asks for first."""
+    """Return the key figures of a result."""
     names = ("x_minus_y", "x_minus_z")
     return {
         "differences_mm": dict(zip(names, (result.differences / MM).tolist(), strict=True)),
@@ -166,7 +172,7 @@ def outcome_document(result: LeverArmEstimate) -> dict[str, Any]:
 
 
 def _profile(run: Run) -> dict[str, Any]:
-    """How a rotation went."""
+    """Return the properties of a rotation."""
     rotation, aligned = run.rotation, run.aligned
     return {
         "run": run.label,
@@ -177,8 +183,8 @@ def _profile(run: Run) -> dict[str, Any]:
         "peak_deg_per_s": rotation.peak_deg_per_s,
         "axis_tilt_deg": rotation.axis_tilt_deg,
         "missing_samples": rotation.missing,
-        "rest_before_s": None if rotation.before is None else rotation.before.duration_s,
-        "rest_after_s": None if rotation.after is None else rotation.after.duration_s,
+        "rest_before_s": rotation.before.duration_s,
+        "rest_after_s": rotation.after.duration_s,
         "alignment": {
             "duration_s": aligned.duration_s,
             "heading_deg": aligned.heading_rad / DEG,

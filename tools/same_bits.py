@@ -31,7 +31,7 @@ import numba
 import numpy as np
 import scipy
 
-from calib.identification import PriorCalibration, identify_captures
+from calib.identification import EstimationOptions, PriorCalibration, identify
 from calib.validation.navigate import navigate
 from calib.validation.trial import TrialSettings
 from imudrv.calibration import Calibration, coefficients
@@ -241,10 +241,11 @@ def identified() -> Results:
             run = scenario([TURN], pose=pose, residuals=residuals)
             captures.append(Path(folder, f"{pose}.raw"))
             captures[-1].write_bytes(b"".join(data for data, _ in record(run, profile.layout())))
-        options: dict[str, Any] = {"joint": {}, "plain": {"method": "plain"}}
-        for name, option in options.items():
-            found = identify_captures(
-                captures, profile, PriorCalibration(WHOLE, "unit", ""), run.site, **option
+        prior = PriorCalibration(WHOLE, "unit", "")
+        for option in (EstimationOptions("joint"), EstimationOptions("plain")):
+            name = option.method
+            found = identify(
+                captures, site=run.site, calibration=prior, profile=profile, options=option
             ).result
             yield f"identify, {name}: arms", sha256(found.R_b)
             yield f"identify, {name}: covariance", sha256(found.covariance, found.correlation)

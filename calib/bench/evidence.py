@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from calib.certificate import certificate, software
 from calib.detection.blocks import BLOCK_NS
 from calib.estimation.joint import estimate_joint
-from calib.estimation.runs import CaptureRuns, Priors, Run, navigate_rotations
+from calib.estimation.runs import CaptureRuns, NavigationOptions, Priors, Run, navigate_rotations
 from calib.identification import CaptureSummary, IdentificationResult, PriorCalibration, Temperature
 from calib.procedure.schema import Procedure, Step
 from imudrv.calibration import Calibration, coefficients
@@ -267,10 +267,8 @@ def _collected(
         lambda: increments,
         known.C_ba,
         site,
-        label=attempt.recording.stem,
-        limits=procedure.rotation_limits(attempt.step),
-        priors=priors,
-        expected=attempt.step.up[1],
+        attempt.recording.stem,
+        NavigationOptions(procedure.rotation_limits(attempt.step), priors, expected=attempt.step.up[1]),
     )
     if len(evidence.runs) != 1:
         reasons = "; ".join(reason for _, reasons in evidence.rejected for reason in reasons) or "no motion"

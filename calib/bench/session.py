@@ -201,12 +201,12 @@ class Session:
             raise
 
     @classmethod
-    def open(cls, folder: Path) -> Self:
+    def open(cls, folder: str | os.PathLike[str]) -> Self:
         """Open a session that is there.
 
         Parameters
         ----------
-        folder : Path
+        folder : path-like
             Its folder.
 
         Returns
@@ -218,6 +218,7 @@ class Session:
         InputError
             There is none, another process has it open, or the journal is damaged: the line is named.
         """
+        folder = Path(folder)
         require_session(folder)
         lock = _locked(folder)
         try:

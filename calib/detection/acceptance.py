@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 from math import hypot, inf
-from typing import Final
+from typing import Final, NamedTuple
 
-from calib.detection.segments import Rotation
+from calib.detection.segments import Rest, Rotation
 from imudrv.records import Flag
 from imudrv.units import STANDARD_GRAVITY, UG, URAD
 
@@ -14,20 +14,20 @@ LEAST_EXTRAPOLATED_DEG_PER_S: Final = 10.0
 
 @dataclass(frozen=True)
 class RotationLimits:
-    """What a rotation of the procedure has to keep; degrees and seconds.
+    """Limits of a rotation of the procedure; degrees and seconds.
 
     Attributes
     ----------
     angle_deg, angle_tolerance_deg : float
         Angle about the vertical, of either sign.
     least_peak_deg_per_s : float
-        Slower than this the lever arms drown in what bias and misalignment do meanwhile.
+        Minimum peak rate; in a slower rotation, bias and misalignment dominate the velocity.
     axis_tilt_deg : float
-        Most that the axis may be off the vertical.
+        Maximum angle between the axis and the vertical.
     rest_before_s, rest_after_s : float
-        Least lengths: to align and to see the velocity before, and to see it after.
+        Minimum rests: for alignment and velocity before, for velocity after.
     missing : int
-        Most samples missing during the rotation.
+        Maximum number of samples missing during the rotation.
     """
 
     angle_deg: float = 180.0
@@ -39,24 +39,49 @@ class RotationLimits:
     missing: int = 0
 
 
+@dataclass(frozen=True)
+class AcceptedRotation(Rotation):
+    """A rotation within the limits; it has a rest before and after it."""
+
+    before: Rest
+    after: Rest
+
+
+class RejectedRotation(NamedTuple):
+    """A motion that is outside the limits, and the reasons."""
+
+    rotation: Rotation
+    reasons: tuple[str, ...]
+
+
+def assess(
+    rotation: Rotation, limits: RotationLimits, expected: str | None = None
+) -> AcceptedRotation | RejectedRotation:
+    """Accept or reject a motion as a rotation of the procedure; see `rejection_reasons`."""
+    reasons = rejection_reasons(rotation, limits, expected)
+    if reasons or rotation.before is None or rotation.after is None:
+        return RejectedRotation(rotation, reasons)
+    return AcceptedRotation(**vars(rotation))
+
+
 def rejection_reasons(
     rotation: Rotation, limits: RotationLimits, expected: str | None = None
 ) -> tuple[str, ...]:
-    """Why a motion cannot serve as a rotation of the procedure.
+    """Return why a motion is not a rotation of the procedure.
 
     Parameters
     ----------
     rotation : Rotation
-        What was found.
-    limits : Limits
-        What it has to keep.
+        A detected motion.
+    limits : RotationLimits
+        Limits of the procedure.
     expected : {'X', 'Y', 'Z'}, optional
-        Body axis that the procedure wants vertical.
+        Body axis that has to be vertical.
 
     Returns
     -------
     tuple of str
-        Reasons, each with its number and its limit; empty: it serves.
+        Reasons, each with value and limit; empty: the rotation is accepted.
     """
     r, reasons = rotation, []
     if expected is not None and r.about != expected:
@@ -67,7 +92,7 @@ def rejection_reasons(
         )
     if r.axis_tilt_deg > limits.axis_tilt_deg:
         reasons.append(
-            f"axis {r.axis_tilt_deg:.1f} deg off the vertical, want {limits.axis_tilt_deg:g} at most"
+            f"axis {r.axis_tilt_deg:.1f} deg off the vertical, want at most {limits.axis_tilt_deg:g}"
         )
     if r.peak_deg_per_s < limits.least_peak_deg_per_s:
         error = ""
@@ -77,8 +102,8 @@ def rejection_reasons(
             f"peak {r.peak_deg_per_s:.0f} deg/s: slower than {limits.least_peak_deg_per_s:g}{error}"
         )
     if r.missing > limits.missing:
-        reasons.append(f"{r.missing} samples missing during the rotation, want {limits.missing} at most")
-    for flag, what in ((Flag.SATURATED, "an axis saturated"), (Flag.FAULT, "the unit told a fault")):
+        reasons.append(f"{r.missing} samples missing during the rotation, want at most {limits.missing}")
+    for flag, what in ((Flag.SATURATED, "an axis saturated"), (Flag.FAULT, "the unit reported a fault")):
         if r.flags & flag:
             reasons.append(f"{what} during the rotation")
     for rest, side, least in (
@@ -93,10 +118,10 @@ def rejection_reasons(
 
 
 def expected_error_mm(peak_deg_per_s: float) -> float:
-    """Error of a lever arm that one velocity a rotation gives, 1 sigma, mm.
+    """Return the 1-sigma error of a lever arm from one velocity per rotation, mm.
 
-    Half a turn from rest to rest of least jerk takes `T = 180 * 1.875 / peak`; it gains 8.8 / T m/s a metre,
-    while 50 ug of bias and 30 urad of gyro misalignment gain `T hypot(b, g m)` m/s.
+    A minimum-jerk half turn takes `T = 180 * 1.875 / peak`; the velocity changes by 8.8 / T m/s per metre of
+    lever arm, and by `T hypot(b, g m)` m/s from b = 50 ug of bias and m = 30 urad of gyro misalignment.
     """
     if peak_deg_per_s <= 0.0:
         return inf

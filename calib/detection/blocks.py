@@ -19,13 +19,13 @@ class Block(NamedTuple):
     dtheta: Vector  # rad, body axes
     force: Vector  # mean, m/s^2
     flags: int  # of any sample
-    missing: int  # samples since the block before's last that are not there
-    hole: bool  # too much is missing to tell rest from motion
-    restarted: bool  # the counter began anew
+    missing: int  # number of samples missing since the last block
+    hole: bool  # too much is missing to distinguish rest from motion
+    restarted: bool  # the counter restarted
 
 
 class BlockSplitter:
-    """Cuts samples into blocks that the counter bounds, however they come in."""
+    """Divider of samples into blocks aligned with the counter, in any pieces."""
 
     def __init__(self, interval_ns: int) -> None:
         self._size = max(1, BLOCK_NS // interval_ns)
@@ -35,13 +35,13 @@ class BlockSplitter:
         self._began(0)
 
     def _began(self, counter: int) -> None:
-        """The counter begins here."""
+        """Start numbering blocks at this counter."""
         self._origin = counter
         self._index, self._last = -1, counter - 1  # of the newest block handed on
         self._waiting.clear()
 
     def feed(self, increments: Records) -> list[Block]:
-        """Take samples and give the blocks that are complete."""
+        """Process samples and return the completed blocks."""
         if not len(increments):
             return []
         counter = increments["counter"]
@@ -77,7 +77,7 @@ class BlockSplitter:
         return self._blocks(rows, index)
 
     def _end(self, index: int) -> int:
-        """Counter of a block's last sample."""
+        """Return the counter of a block's last sample."""
         return self._origin + (index + 1) * self._size - 1
 
     def _blocks(self, rows: Records, index: NDArray[np.int64]) -> list[Block]:
@@ -101,7 +101,7 @@ class BlockSplitter:
 
 
 BLOCK_NS: Final = 20_000_000
-"""Samples are summed over so long, ns."""
+"""Length of a block, ns."""
 
 
 BLOCK: Final = np.dtype(
@@ -119,7 +119,7 @@ BLOCK: Final = np.dtype(
 
 
 def join_blocks(block: Records, more: Records) -> None:
-    """Add to a block, in place, what a later piece has of it."""
+    """Add to a block, in place, its samples of a later piece."""
     for whole, inside in (("dtheta_b", "angle"), ("dv_b", "velocity")):
         block[inside] += more[inside] + more["samples"] * block[whole]
         block[whole] += more[whole]

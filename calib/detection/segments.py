@@ -1,21 +1,21 @@
-"""Rest, rotation and orientation, found in the increments themselves; nobody types times.
+"""Detection of rests and rotations in increments.
 
-Increments are summed into blocks of 20 ms in one pass, so that an hour stays small. What moves is decided
-from the data's own noise floor: the quietest fifth of all seconds says how restless blocks are at rest.
+Increments are summed into blocks of 20 ms in one pass, so that an hour needs little memory. The noise at rest
+is that of the quietest fifth of all seconds.
 
-    motion   rate above twice the Earth's and above the noise, or specific force off the rest's own, or
-             samples missing for more than half a block; a quiet spell under a second belongs to it
-    rest     what lies between motions
+    motion   rate above twice the Earth's and above the noise, or specific force different from that of the
+             rest, or more than half a block missing; includes quiet intervals under a second
+    rest     the intervals between motions
 
-A motion's angle is counted about the vertical as the body sees it (specific force of the rest before, carried
-on by the gyros); its axis is that of the sum of its angles. Whether it is a rotation of the procedure is for
-`judge` to say: every rejection bears its number and its limit.
+The angle of a motion is measured about the vertical in body axes (specific force of the rest before,
+propagated by the gyros); its axis is that of the sum of its angles. `calib.detection.acceptance` decides
+whether a motion is a rotation of the procedure.
 """
 
 from collections.abc import Iterable
 from dataclasses import dataclass
 from math import acos
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,37 +39,37 @@ from imudrv.records import Records
 from imudrv.units import DEG, NS, UG
 
 QUIET_S: Final = 1.0
-"""A shorter quiet spell belongs to the motion around it, s."""
+"""Minimum length of a rest; shorter quiet intervals are merged into the motion, s."""
 
 
 SIGMAS: Final = 8.0
-"""A block so many noise floors off its rest is motion."""
+"""Deviation of a block from its rest that counts as motion, in multiples of the noise floor."""
 
 
 LEAST_FORCE: Final = 300.0 * UG
-"""A change of specific force below this is not motion, m/s^2."""
+"""Smallest change of specific force that counts as motion, m/s^2."""
 
 
 @dataclass(frozen=True)
 class Rest:
-    """A stretch at rest.
+    """An interval at rest.
 
     Attributes
     ----------
     start, stop : int
-        Counter of the first sample and of the first behind the last.
+        Counter of the first sample, and of the first after the last.
     start_s, stop_s : float
-        From the capture's beginning, by the counter.
+        Time from the beginning of the capture, by the counter.
     up : str
         Body axis that points up, '+X' to '-Z'.
     up_b : ndarray, shape (3,)
         Unit vector up, body axes.
     f_b : ndarray, shape (3,)
         Mean specific force, m/s^2.
-    differences : Differences or None
-        They tell the noise; None: too short.
+    differences : SecondDifferences or None
+        For the noise; None: the rest is too short.
     missing : int
-        Samples that are missing.
+        Number of missing samples.
     """
 
     start: int
@@ -84,7 +84,7 @@ class Rest:
 
     @property
     def noise(self) -> Noise | None:
-        """Noise in this rest; None: too short to tell."""
+        """Noise of this rest, or None if it is too short."""
         return pooled_noise([self.differences]) if self.differences else None
 
     @property
@@ -95,30 +95,30 @@ class Rest:
 
 @dataclass(frozen=True)
 class Rotation:
-    """A motion between two rests; `judge` says whether it is a rotation of the procedure.
+    """A motion between two rests; `calib.detection.acceptance.assess` accepts or rejects it.
 
     Attributes
     ----------
     start, stop : int
-        Counter of the first sample and of the first behind the last.
+        Counter of the first sample, and of the first after the last.
     start_s, stop_s : float
-        From the capture's beginning, by the counter.
+        Time from the beginning of the capture, by the counter.
     before, after : Rest or None
-        The rests beside it; None: the capture begins or ends in motion.
+        The rests before and after it; None: the capture begins or ends in motion.
     angle_deg : float
-        Turned about the vertical, right-handed about up.
+        Angle about the vertical, right-handed about up.
     axis : str
         Body axis that was vertical, '+X' to '-Z'.
     about : str
-        Body axis nearest to the axis of the turn, 'X', 'Y' or 'Z'.
+        Body axis nearest to the rotation axis, 'X', 'Y' or 'Z'.
     axis_tilt_deg : float
-        Of the turn's axis from the vertical, 0 to 90.
+        Angle between the rotation axis and the vertical, 0 to 90.
     peak_deg_per_s : float
         Largest rate of a block.
     missing : int
-        Samples that are missing.
+        Number of missing samples.
     flags : int
-        `Flag` bits that any sample bears.
+        `Flag` bits of any sample.
     """
 
     start: int
@@ -143,7 +143,7 @@ class Rotation:
 
 @dataclass(frozen=True)
 class Segments:
-    """What a capture consists of.
+    """Rests and rotations of a capture.
 
     Attributes
     ----------
@@ -152,9 +152,9 @@ class Segments:
     interval_s : float
         Sample interval.
     duration_s : float
-        Of the capture, by the counter.
+        Length of the capture, by the counter.
     rests : tuple of Rest
-        In order.
+        All rests, in order.
     rotations : tuple of Rotation
         Every motion, in order.
     """
@@ -167,7 +167,7 @@ class Segments:
 
 
 class Segmenter:
-    """Finds rests and motions; feed it in any pieces, the result is the same."""
+    """Detector of rests and motions; the result does not depend on how the increments are divided."""
 
     def __init__(self) -> None:
         self._blocks: list[Records] = []
@@ -176,7 +176,7 @@ class Segmenter:
         self._last = 0
 
     def feed(self, increments: Records) -> None:
-        """Take increments.
+        """Process increments.
 
         Parameters
         ----------
@@ -214,7 +214,7 @@ class Segmenter:
         return max(1, BLOCK_NS // self._nominal_ns)
 
     def result(self) -> Segments:
-        """Rests and motions of all that was fed.
+        """Return the rests and motions of all increments.
 
         Returns
         -------
@@ -223,22 +223,22 @@ class Segmenter:
         Raises
         ------
         InputError
-            There is nothing to look at.
+            The capture is too short.
         """
         blocks = np.concatenate(self._blocks) if self._blocks else np.zeros(0, BLOCK)
         if len(blocks) * BLOCK_NS * NS < 2.0 * QUIET_S:
             raise InputError(
-                f"segments: expected a capture of {2.0 * QUIET_S:g} s at least, got "
+                f"segments: expected a capture of at least {2.0 * QUIET_S:g} s, got "
                 f"{len(blocks) * BLOCK_NS * NS:.1f} s"
             )
         size, end = self._samples_a_block, self._last + 1
-        if (end - self._first) % size:  # a few samples do not average out: they would pass for a motion
+        if (end - self._first) % size:  # the noise of a few samples would look like motion
             blocks, end = blocks[:-1], self._first + int(blocks["index"][-1]) * size
-        return _Found(blocks, size, self._first, end, self._nominal_ns * NS).segments()
+        return _segments(_Blocks(blocks, size, self._first, end, self._nominal_ns * NS))
 
 
 def find_segments(pieces: Iterable[Records]) -> Segments:
-    """Rests and motions of a whole capture.
+    """Return the rests and motions of a whole capture.
 
     Parameters
     ----------
@@ -252,7 +252,7 @@ def find_segments(pieces: Iterable[Records]) -> Segments:
     Raises
     ------
     InputError
-        There is nothing to look at.
+        The capture is too short.
     """
     segmenter = Segmenter()
     for piece in pieces:
@@ -260,152 +260,163 @@ def find_segments(pieces: Iterable[Records]) -> Segments:
     return segmenter.result()
 
 
-class _Found:
-    """The work on the blocks of one capture."""
+class _Blocks(NamedTuple):
+    """Blocks of a capture and their place on the counter."""
 
-    def __init__(self, blocks: Records, size: int, first: int, end: int, interval_s: float) -> None:
-        self.blocks, self.size, self.first, self.end, self.interval_s = blocks, size, first, end, interval_s
-        dt = blocks["interval_ns"][:, None] * NS
-        self.rate, self.force = blocks["dtheta_b"] / dt, blocks["dv_b"] / dt
+    rows: Records  # BLOCK
+    size: int  # samples per block
+    first: int  # counter of the first sample
+    end: int  # counter after the last sample
+    interval_s: float
 
-    def segments(self) -> Segments:
-        rate_floor, force_floor = self._floor(self.rate), self._floor(self.force)
-        moving = np.linalg.norm(self.rate, axis=1) > 2.0 * EARTH_RATE + SIGMAS * rate_floor
-        moving |= self._holes()
-        for begin, stop in _runs(self._joined(moving), False):
-            off = self.force[begin:stop] - np.median(self.force[begin:stop], axis=0)
-            moving[begin:stop] |= np.linalg.norm(off, axis=1) > LEAST_FORCE + SIGMAS * force_floor
-        moving = self._joined(moving)
-        rests = {begin: self._rest(begin, stop) for begin, stop in _runs(moving, False)}
-        ends = {rest_stop: rests[begin] for begin, rest_stop in _runs(moving, False)}
-        rotations = [
-            self._rotation(begin, stop, ends.get(begin), rests.get(stop))
-            for begin, stop in _runs(moving, True)
-        ]
-        return Segments(
-            self.first,
-            self.interval_s,
-            (self.end - self.first) * self.interval_s,
-            tuple(rests.values()),
-            tuple(rotations),
-        )
-
-    def _floor(self, x: Array) -> float:
-        """Restlessness of the quietest fifth of the seconds."""
-        a_second = max(1, round(1.0 / (self.size * self.interval_s)))
-        n = len(x) // a_second
-        seconds = x[: n * a_second].reshape(n, a_second, 3)
-        off = seconds - seconds.mean(axis=1, keepdims=True)
-        return float(np.quantile(np.sqrt((off**2).sum(axis=2).mean(axis=1)), 0.2))
-
-    def _holes(self) -> NDArray[np.bool_]:
-        """Blocks in or before which too much is missing to call them rest."""
-        lost = self.blocks["interval_ns"] * NS < 0.5 * self.size * self.interval_s
-        lost[1:] |= np.diff(self.blocks["index"]) > 1
-        return np.asarray(lost, np.bool_)
-
-    def _joined(self, moving: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Motion, one block wider on both sides, with the short quiet spells in it."""
-        wide = moving.copy()
-        wide[1:] |= moving[:-1]
-        wide[:-1] |= moving[1:]
-        for begin, stop in _runs(wide, False):
-            inside = begin > 0 and stop < len(wide)
-            if inside and (self._at(stop) - self._at(begin)) * self.interval_s < QUIET_S:
-                wide[begin:stop] = True
-        return wide
-
-    def _at(self, block: int) -> int:
-        """Counter at a block's beginning."""
-        if block == len(self.blocks):
+    def counter(self, block: int) -> int:
+        """Return the counter at a block's beginning."""
+        if block == len(self.rows):
             return self.end
-        return self.first + int(self.blocks["index"][block]) * self.size
+        return self.first + int(self.rows["index"][block]) * self.size
 
-    def _s(self, counter: int) -> float:
-        return (counter - self.first) * self.interval_s
+    def seconds(self, block: int) -> float:
+        """Return the time at a block's beginning, s."""
+        return (self.counter(block) - self.first) * self.interval_s
 
-    def _missing(self, begin: int, stop: int) -> int:
-        """Samples that are missing, but for those that a long interval bridges."""
-        there = round(float(self.blocks["interval_ns"][begin:stop].sum()) * NS / self.interval_s)
-        return self._at(stop) - self._at(begin) - there
+    def missing(self, begin: int, stop: int) -> int:
+        """Return the number of missing samples, except those that a long interval covers."""
+        covered = round(float(self.rows["interval_ns"][begin:stop].sum()) * NS / self.interval_s)
+        return self.counter(stop) - self.counter(begin) - covered
 
-    def _rest(self, begin: int, stop: int) -> Rest:
-        part = slice(begin, stop)
-        seconds = self.blocks["interval_ns"][part].sum() * NS
-        f_b = self.blocks["dv_b"][part].sum(axis=0) / seconds
-        start, end = self._at(begin), self._at(stop)
-        return Rest(
-            start,
-            end,
-            self._s(start),
-            self._s(end),
-            up=axis_name(f_b),
-            up_b=f_b / np.linalg.norm(f_b),
-            f_b=f_b,
-            differences=self._differences(part, f_b),
-            missing=self._missing(begin, stop),
-        )
 
-    def _differences(self, part: slice, f_b: Array) -> SecondDifferences | None:
-        w = round(BIN_S / (self.size * self.interval_s))
-        level = np.arange(3) != int(np.argmax(np.abs(f_b)))
-        angle = self._means(part, "dtheta_b", "angle")
-        velocity = self._means(part, "dv_b", "velocity")[:, level]
-        n = len(angle) // w
-        if n * BIN_S < LEAST_NOISE_S:
-            return None
-        single = np.diff(np.cumsum(self.blocks["dv_b"][part][:, level], axis=0), 2, axis=0)
-        angle, velocity = (x[: n * w].reshape(n, w, -1).mean(axis=1) for x in (angle, velocity))
-        return SecondDifferences(
-            np.array([max(0, n - 2 * k) for k in LAGS], np.float64),
-            mean_squares(angle),
-            mean_squares(velocity),
-            float((single**2).mean()),
-        )
+def _segments(blocks: _Blocks) -> Segments:
+    """Divide a capture into rests and rotations."""
+    moving = _moving_mask(blocks)
+    still = _runs(moving, False)
+    rests = [_rest(blocks, begin, stop) for begin, stop in still]
+    before = {stop: rest for (_, stop), rest in zip(still, rests, strict=True)}
+    after = {begin: rest for (begin, _), rest in zip(still, rests, strict=True)}
+    return Segments(
+        blocks.first,
+        blocks.interval_s,
+        (blocks.end - blocks.first) * blocks.interval_s,
+        tuple(rests),
+        tuple(
+            _rotation(blocks, begin, stop, before.get(begin), after.get(stop))
+            for begin, stop in _runs(moving, True)
+        ),
+    )
 
-    def _means(self, part: slice, whole: str, inside: str) -> Array:
-        """Mean over each block of the sum since the beginning."""
-        blocks = self.blocks[part]
-        begins = np.cumsum(blocks[whole], axis=0) - blocks[whole]
-        return np.asarray(begins + blocks[inside] / blocks["samples"][:, None], np.float64)
 
-    def _rotation(self, begin: int, stop: int, before: Rest | None, after: Rest | None) -> Rotation:
-        part = slice(begin, stop)
-        dtheta = self.blocks["dtheta_b"][part]
-        q = (1.0, 0.0, 0.0, 0.0)  # from the body during the motion to the body before it
-        turns = []
-        for angle in map(tuple, dtheta.tolist()):
-            turns.append(q)  # a fixed axis sees up alike at a block's beginning and in its middle
-            q = unit(product(q, quaternion_of_vector(angle)))
-        if before is not None:
-            up = before.up_b
-        elif after is not None:
-            up = np.array(turn(q, tuple(after.up_b.tolist())))
-        else:
-            mean = self.force[part].mean(axis=0)
-            up = mean / np.linalg.norm(mean)
-        up_b = np.array([turn(conjugate(m), tuple(up.tolist())) for m in turns])
-        total = dtheta.sum(axis=0)
-        size = float(np.linalg.norm(total)) or 1.0
-        start, end = self._at(begin), self._at(stop)
-        return Rotation(
-            start,
-            end,
-            self._s(start),
-            self._s(end),
-            before,
-            after,
-            angle_deg=float((dtheta * up_b).sum()) / DEG,
-            axis=axis_name(up),
-            about=axis_name(total)[1],
-            axis_tilt_deg=acos(min(1.0, abs(float(total @ up)) / size)) / DEG,
-            peak_deg_per_s=float(np.linalg.norm(self.rate[part], axis=1).max()) / DEG,
-            missing=self._missing(begin, stop),
-            flags=int(np.bitwise_or.reduce(self.blocks["flags"][part])),
-        )
+def _moving_mask(blocks: _Blocks) -> NDArray[np.bool_]:
+    """Return which blocks are in motion."""
+    rows = blocks.rows
+    dt = rows["interval_ns"][:, None] * NS
+    rate, force = rows["dtheta_b"] / dt, rows["dv_b"] / dt
+    per_second = max(1, round(1.0 / (blocks.size * blocks.interval_s)))
+    force_limit = LEAST_FORCE + SIGMAS * _noise_floor(force, per_second)
+    moving = np.linalg.norm(rate, axis=1) > 2.0 * EARTH_RATE + SIGMAS * _noise_floor(rate, per_second)
+    moving |= rows["interval_ns"] * NS < 0.5 * blocks.size * blocks.interval_s
+    moving[1:] |= np.diff(rows["index"]) > 1  # whole blocks are missing
+    for begin, stop in _runs(_merged(moving, blocks), False):
+        change = force[begin:stop] - np.median(force[begin:stop], axis=0)
+        moving[begin:stop] |= np.linalg.norm(change, axis=1) > force_limit
+    return _merged(moving, blocks)
+
+
+def _noise_floor(x: Array, per_second: int) -> float:
+    """Return the rms about the mean of a second, of the quietest fifth of all seconds."""
+    n = len(x) // per_second
+    seconds = x[: n * per_second].reshape(n, per_second, 3)
+    deviation = seconds - seconds.mean(axis=1, keepdims=True)
+    return float(np.quantile(np.sqrt((deviation**2).sum(axis=2).mean(axis=1)), 0.2))
+
+
+def _merged(moving: NDArray[np.bool_], blocks: _Blocks) -> NDArray[np.bool_]:
+    """Widen each motion by one block on both sides and include the short quiet intervals in it."""
+    wide = moving.copy()
+    wide[1:] |= moving[:-1]
+    wide[:-1] |= moving[1:]
+    for begin, stop in _runs(wide, False):
+        inside = begin > 0 and stop < len(wide)
+        if inside and (blocks.counter(stop) - blocks.counter(begin)) * blocks.interval_s < QUIET_S:
+            wide[begin:stop] = True
+    return wide
+
+
+def _rest(blocks: _Blocks, begin: int, stop: int) -> Rest:
+    rows = blocks.rows[begin:stop]
+    f_b = rows["dv_b"].sum(axis=0) / (rows["interval_ns"].sum() * NS)
+    return Rest(
+        blocks.counter(begin),
+        blocks.counter(stop),
+        blocks.seconds(begin),
+        blocks.seconds(stop),
+        up=axis_name(f_b),
+        up_b=f_b / np.linalg.norm(f_b),
+        f_b=f_b,
+        differences=_second_differences(rows, round(BIN_S / (blocks.size * blocks.interval_s)), f_b),
+        missing=blocks.missing(begin, stop),
+    )
+
+
+def _second_differences(rows: Records, per_bin: int, f_b: Array) -> SecondDifferences | None:
+    """Return the second differences of a rest, or None if it is too short."""
+    n = len(rows) // per_bin
+    if n * BIN_S < LEAST_NOISE_S:
+        return None
+    level = np.arange(3) != int(np.argmax(np.abs(f_b)))
+    angle = _block_means(rows, "dtheta_b", "angle")
+    velocity = _block_means(rows, "dv_b", "velocity")[:, level]
+    single = np.diff(np.cumsum(rows["dv_b"][:, level], axis=0), 2, axis=0)
+    angle, velocity = (x[: n * per_bin].reshape(n, per_bin, -1).mean(axis=1) for x in (angle, velocity))
+    return SecondDifferences(
+        np.array([max(0, n - 2 * k) for k in LAGS], np.float64),
+        mean_squares(angle),
+        mean_squares(velocity),
+        float((single**2).mean()),
+    )
+
+
+def _block_means(rows: Records, whole: str, inside: str) -> Array:
+    """Return the mean over each block of the sum since the beginning."""
+    begins = np.cumsum(rows[whole], axis=0) - rows[whole]
+    return np.asarray(begins + rows[inside] / rows["samples"][:, None], np.float64)
+
+
+def _rotation(blocks: _Blocks, begin: int, stop: int, before: Rest | None, after: Rest | None) -> Rotation:
+    rows = blocks.rows[begin:stop]
+    dt = rows["interval_ns"][:, None] * NS
+    dtheta = rows["dtheta_b"]
+    q = (1.0, 0.0, 0.0, 0.0)  # from the body during the motion to the body before it
+    attitudes = []
+    for angle in map(tuple, dtheta.tolist()):
+        attitudes.append(q)  # for a fixed axis, up_b is the same at a block's beginning and in its middle
+        q = unit(product(q, quaternion_of_vector(angle)))
+    if before is not None:
+        up = before.up_b
+    elif after is not None:
+        up = np.array(turn(q, tuple(after.up_b.tolist())))
+    else:
+        mean = (rows["dv_b"] / dt).mean(axis=0)
+        up = mean / np.linalg.norm(mean)
+    up_b = np.array([turn(conjugate(attitude), tuple(up.tolist())) for attitude in attitudes])
+    total = dtheta.sum(axis=0)
+    size = float(np.linalg.norm(total)) or 1.0
+    return Rotation(
+        blocks.counter(begin),
+        blocks.counter(stop),
+        blocks.seconds(begin),
+        blocks.seconds(stop),
+        before,
+        after,
+        angle_deg=float((dtheta * up_b).sum()) / DEG,
+        axis=axis_name(up),
+        about=axis_name(total)[1],
+        axis_tilt_deg=acos(min(1.0, abs(float(total @ up)) / size)) / DEG,
+        peak_deg_per_s=float(np.linalg.norm(dtheta / dt, axis=1).max()) / DEG,
+        missing=blocks.missing(begin, stop),
+        flags=int(np.bitwise_or.reduce(rows["flags"])),
+    )
 
 
 def _runs(mask: NDArray[np.bool_], value: bool) -> list[tuple[int, int]]:
-    """Begin and stop of the stretches of `mask` that are `value`."""
+    """Return begin and stop of the intervals in which `mask` is `value`."""
     edges = np.flatnonzero(np.diff(np.concatenate([[not value], mask, [not value]]) == value))
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))

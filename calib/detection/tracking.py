@@ -1,7 +1,7 @@
-"""What samples tell about motion as they come: rest, gravity, attitude, a turn; in blocks of 20 ms.
+"""Online detection of rest, tilt, heading and rotation, in blocks of 20 ms.
 
-The counter bounds the blocks, so that any cut into pieces gives the same ones. What counts as motion is the
-rule of `calib.detection.segments`, which judges the whole afterwards.
+Blocks are aligned with the counter and do not depend on how the samples are divided. The criterion of motion
+is that of `calib.detection.segments`, which evaluates the whole capture afterwards.
 """
 
 from collections import deque
@@ -19,7 +19,7 @@ from imudrv.units import DEG, NS, STANDARD_GRAVITY
 from imudrv.vectors import Vector, add, dot, scale, subtract
 
 SMOOTH_S: Final = 0.2
-"""Gravity is smoothed over so long while the unit is carried, s."""
+"""Time constant of the smoothed gravity while the unit is carried, s."""
 
 
 MG: Final = 1e-3 * STANDARD_GRAVITY
@@ -27,7 +27,7 @@ MG: Final = 1e-3 * STANDARD_GRAVITY
 
 
 class StillnessDetector:
-    """Whether the unit stands still, by the rule of `calib.detection.segments`, as the samples come."""
+    """Online detector of rest, with the criterion of `calib.detection.segments`."""
 
     def __init__(self, rate_limit: float, force_limit: float) -> None:
         self.moving = False
@@ -41,11 +41,11 @@ class StillnessDetector:
         self.limit(rate_limit, force_limit)
 
     def limit(self, rate: float, force: float) -> None:
-        """What counts as motion: a rate of more, rad/s, or a change of specific force, m/s^2."""
+        """Set the largest rate, rad/s, and change of specific force, m/s^2, of a rest."""
         self._rate_limit, self._force_limit = rate, force
 
     def feed(self, block: Block) -> None:
-        """Take a block."""
+        """Process a block."""
         self.rate = hypot(*block.dtheta) / block.seconds
         over, off = self.rate / self._rate_limit, 0.0
         if self._blocks:
@@ -63,12 +63,12 @@ class StillnessDetector:
 
     @property
     def stillness(self) -> float:
-        """As in `View`."""
+        """Stillness over the last half second, 0 (motion) to 1 (rest)."""
         return 1.0 - min(1.0, max(0.0, max(self._recent) - 1.0) / 9.0)
 
     @property
     def why(self) -> str:
-        """Latest motion, with its number and limit."""
+        """Description of the latest motion, with value and limit."""
         if self._over >= self._off:
             return f"{self._over * self._rate_limit / DEG:.2f} deg/s, limit {self._rate_limit / DEG:.2f}"
         mg = self._force_limit / MG
@@ -76,31 +76,31 @@ class StillnessDetector:
 
 
 class RestAverages:
-    """Mean readings of a rest, and their noise."""
+    """Mean rate and specific force of a rest, and their noise."""
 
     def __init__(self) -> None:
         self.flags = 0
         self._rows: list[tuple[float, ...]] = []
 
     def feed(self, block: Block) -> None:
-        """Take a block."""
+        """Process a block."""
         self.flags |= block.flags
         self._rows.append((*scale(1.0 / block.seconds, block.dtheta), *block.force))
 
     @property
     def rate(self) -> Array:
-        """Rad/s, shape (3,)."""
+        """Mean rate, rad/s, shape (3,)."""
         mean: Array = np.mean(self._rows, axis=0)[:3]
         return mean
 
     @property
     def force(self) -> Array:
-        """m/s^2, shape (3,)."""
+        """Mean specific force, m/s^2, shape (3,)."""
         mean: Array = np.mean(self._rows, axis=0)[3:]
         return mean
 
     def forget(self, rate_limit: float, force_limit: float) -> int:
-        """Leave out all up to the last motion, which has a rate or a change of force of more; blocks kept."""
+        """Drop everything up to the last block over a limit; return the number of blocks kept."""
         rows = np.array(self._rows).reshape(-1, 2, 3)
         rate, off = rows[:, 0], rows[:, 1] - np.median(rows[:, 1], axis=0)
         moving = (np.linalg.norm(rate, axis=1) > rate_limit) | (np.linalg.norm(off, axis=1) > force_limit)
@@ -109,7 +109,7 @@ class RestAverages:
         return len(self._rows)
 
     def noise(self) -> tuple[float, float]:
-        """Rms of rate, rad/s, and specific force, m/s^2, in the quietest fifth of the seconds."""
+        """Return the rms of rate, rad/s, and specific force, m/s^2, in the quietest fifth of the seconds."""
         a_second = round(1.0 / (BLOCK_NS * NS))
         n = len(self._rows) // a_second
         seconds = np.array(self._rows[: n * a_second]).reshape(n, a_second, 2, 3)
@@ -119,12 +119,12 @@ class RestAverages:
 
 
 class AttitudeTracker:
-    """How the unit lies: gravity, and once an alignment has told it, attitude, carried on by the gyros.
+    """Gravity in body axes and, after an alignment, the attitude propagated by the gyros.
 
     Parameters
     ----------
     latitude_rad : float
-        Of the place.
+        Geodetic latitude.
     """
 
     def __init__(self, latitude_rad: float) -> None:
@@ -133,7 +133,7 @@ class AttitudeTracker:
         self._earth_n = earth_rate_n(latitude_rad)
 
     def feed(self, block: Block) -> None:
-        """Take a block."""
+        """Process a block."""
         share = min(1.0, block.seconds / SMOOTH_S)
         before = self.force or block.force
         self.force = add(before, scale(share, subtract(block.force, before)))
@@ -149,13 +149,13 @@ class AttitudeTracker:
         return axis_name(np.array(self.force or (0.0, 0.0, 1.0)))
 
     def lean(self, axis_b: Array) -> float:
-        """Angle between an axis and the vertical, rad."""
+        """Return the angle between an axis and the vertical, rad."""
         if self.force is None:
             return pi
         return acos(max(-1.0, min(1.0, dot(self.force, _vector(axis_b)) / hypot(*self.force))))
 
     def azimuth(self, axis_b: Array) -> float | None:
-        """Direction of an axis, from north to east, rad, -pi to pi; None: not known."""
+        """Return the azimuth of an axis, from north to east, rad, -pi to pi; None: unknown."""
         if self.q_nb is None:
             return None
         east, north, _ = turn(self.q_nb, _vector(axis_b))
@@ -168,7 +168,7 @@ def _vector(v: Array) -> Vector:
 
 
 class RotationTracker:
-    """A turn as it happens."""
+    """Angle, rate and axis of a rotation in progress."""
 
     def __init__(self, up_b: Vector = (0.0, 0.0, 1.0)) -> None:
         self.begun: int | None = None  # counter
@@ -179,7 +179,7 @@ class RotationTracker:
         self._up_before = self._up = up_b
 
     def feed(self, block: Block) -> None:
-        """Take a block."""
+        """Process a block."""
         if self.begun is None:
             self.begun = block.last
         about_up = dot(block.dtheta, self._up)
@@ -191,15 +191,15 @@ class RotationTracker:
 
     @property
     def size(self) -> float:
-        """Of the whole turn, rad."""
+        """Total angle, rad."""
         return hypot(*self._total)
 
     @property
     def axis_tilt(self) -> float:
-        """Of its axis from the vertical, rad."""
+        """Angle between the axis and the vertical, rad."""
         return acos(min(1.0, abs(dot(self._total, self._up_before)) / self.size))
 
     @property
     def about(self) -> str:
-        """Body axis nearest to its axis, 'X', 'Y' or 'Z'."""
+        """Body axis nearest to the rotation axis, 'X', 'Y' or 'Z'."""
         return axis_name(np.array(self._total))[1]

@@ -1,28 +1,27 @@
-"""Runs to the inner lever arms: the literature's plain solution, and the joint estimate (the default).
+"""Joint estimate of the lever arms and the residual calibration errors from all rests.
 
-The velocity that a run leaves at rest answers linearly to what is left in the increments (mathematics,
-section 4; the matrices H, B, P, Q are those of `imudrv.nav.mechanisation`). Measured minus true, horizontal
-parts:
+The velocity at rest is linear in the residual errors of the increments (mathematics, section 4; the matrices
+H, B, P, Q are those of `imudrv.nav.mechanisation`). Measured minus true, horizontal components:
 
     delta v = H R + B b_a + A vec(dA) + f x ( integral of phi )
     phi(t)  = (I - t [omega_ie x]) phi_0 - B b_g - P vec(dG)
 
-with the integral of C_nb dA f_b = A vec(dA). Tilt and heading in error at the start of each run, phi_0, are
-unknowns of that run; all else is common to the session. Heading is among them because the Earth's rotation
-makes a tilt rate of it, as large as that of a gyro's bias: the alignment has chosen the heading that hides
-the bias in the first pose, and the turn brings both to light.
+with the integral of C_nb dA f_b = A vec(dA). The errors of tilt and heading at the start of each run, phi_0,
+are parameters of that run; all others are common to the session. Heading is included because the Earth's
+rotation turns its error into a tilt rate as large as that of a gyro bias: the alignment has chosen the
+heading that compensates the bias in the first pose, and the rotation makes both observable.
 
-**Noise.** Pulses leave white noise in velocity and, once a run, that of its start; accelerometers a random
+**Noise.** Pulses cause white noise of velocity, once more at the start of a run; accelerometers a random
 walk q_v; gyros a random walk q_a of tilt, which gravity integrates. Over a run
 
     cov(s, t) = q_v^2 min(s, t) + g^2 q_a^2 s^2 (3 t - s) / 6 + start^2 + white^2 [s = t],      s <= t
 
-Their sizes are those that the rests themselves show. Rows are whitened by the Cholesky factor.
+Their magnitudes are estimated from the rests. Rows are whitened by the Cholesky factor.
 
-**Rank.** Of the information on R, all else marginalised, each eigenvalue l sees its direction with 1 /
-sqrt(l). What is seen no better than `Priors.arm` is not seen. Rotations between rests never see a common
-shift of the three points (the gauge): R is solved for in the six-space that has none, which is the gauge
-`centroid`.
+**Rank.** An eigenvalue l of the information on R, all other parameters marginalised, gives its direction a
+sigma of 1 / sqrt(l). A direction whose sigma is not below `Priors.arm` is unobservable. Rotations between
+rests do not determine a common shift of the three points (the gauge): R is solved for in the six-dimensional
+space without such a shift, which is the gauge `centroid`.
 """
 
 from collections.abc import Sequence
@@ -58,11 +57,11 @@ from imudrv.errors import InputError
 from imudrv.units import STANDARD_GRAVITY, UG
 
 PIVOT_LIMIT: Final = 10.0
-"""Chi-square that a pivot of each rotation's own may explain, for each of its components."""
+"""Largest reduction of chi-square per component by a separate pivot for each rotation."""
 
 
 PIVOT_SIGMA: Final = 0.1
-"""Prior of such a pivot, m."""
+"""Prior sigma of such a pivot, m."""
 
 
 def estimate_joint(
@@ -73,41 +72,41 @@ def estimate_joint(
     nine: bool = False,
     extra: Sequence[Extra] = (),
 ) -> LeverArmEstimate:
-    """Estimate R with all that the rests before and after tell; the default method.
+    """Estimate R jointly with the residual calibration errors; the default method.
 
     Parameters
     ----------
     runs : sequence of Run
         Any number, poses and signs, from any captures of one unit.
     priors : Priors, optional
-        What the static calibration leaves.
+        Uncertainty of the static calibration.
     pivot : {'free', 'fixed'}
         `fixed`: the origin of b is known to stay still while the unit turns, as on a turntable; velocity is
-        then known during the motion too, and R is told from that origin.
+        then known during the motion too, and R refers to that origin.
     nine : bool
-        All nine components are wanted, which needs a known pivot.
+        Whether all nine components are required, which needs a known pivot.
     extra : sequence of {'quadratic'}
-        More unknowns: a quadratic term on each sensing axis, 1/(m/s^2). Those that are not observable stay
-        at their prior, and a note says so.
+        Additional parameters: a quadratic term of each sensing axis, 1/(m/s^2). Unobservable ones stay at
+        their prior, with a note.
 
     Returns
     -------
-    Identification
+    LeverArmEstimate
 
     Raises
     ------
     InputError
-        No runs; nine components without a known pivot; rotations that do not see what is asked for; a pivot
-        that the data contradict.
+        There are no runs; nine components without a known pivot; the rotations do not determine the
+        required directions; or the data contradict the pivot.
     """
     priors = priors or Priors()
     terms = parameter_groups(priors, extra)
     require_runs(runs)
     if nine and pivot == "free":
         raise InputError(
-            "identification: nine components of the lever arms were asked for, but rotations between rests "
-            "see six: a common shift of the three sensing points leaves no velocity at rest; name a gauge, "
-            "or turn the unit about a pivot that stays still and say so (pivot fixed)"
+            "identification: expected a fixed pivot for nine components of the lever arms, got pivot free: "
+            "rotations between rests determine six, as a common shift of the three sensing points causes no "
+            "velocity at rest; choose another gauge, or turn the unit about a fixed point and use pivot fixed"
         )
     noise = rest_noise(runs)
     system = NormalEquations(
@@ -123,14 +122,13 @@ def estimate_joint(
     chi_square, freedom = system.chi_square(x, wanted)
     if pivot == "fixed":
         _check_pivot(system, chi_square, freedom)
-    names = system.unknowns.names
+    names = system.parameters.names
     spread = np.sqrt(np.diag(covariance))
     parameters = tuple(
         ParameterEstimate(name, float(value), float(s), float(prior))
-        for name, value, s, prior in zip(names, x[9:], spread[9:], system.unknowns.sigma, strict=True)
+        for name, value, s, prior in zip(names, x[9:], spread[9:], system.parameters.sigma, strict=True)
     )
-    told = [velocity_gain(run) for run in runs]
-    seen = sigma[sigma < priors.arm]
+    gains = [velocity_gain(run) for run in runs]
     return LeverArmEstimate(
         method="joint",
         gauge="given" if pivot == "fixed" else "centroid",
@@ -138,45 +136,45 @@ def estimate_joint(
         covariance=covariance[:9, :9],
         rank=rank,
         direction_sigma=sigma,
-        singular_values=singular_values_of(told),
-        reason=rank_reason(rank, seen[-1], sigma, priors.arm),
+        singular_values=singular_values_of(gains),
+        reason=rank_reason(rank, sigma, priors.arm),
         chi_square=chi_square,
         degrees_of_freedom=freedom,
         noise=noise,
         parameters=parameters,
         correlation=covariance[:9, 9:] / np.outer(np.maximum(spread[:9], 1e-300), spread[9:]),
         leave_one_out=tuple(
-            _left_out(system, k, run.label, x, basis, priors.arm) for k, run in enumerate(runs)
+            _without(system, k, run.label, x, basis, priors.arm) for k, run in enumerate(runs)
         ),
         runs=tuple(
-            run_result(run, *told[k], x[:9], part.t_s, part.v_n, part.columns @ x[system.columns_of(k)])
+            run_result(run, *gains[k], x[:9], part.t_s, part.v_n, part.columns @ x[system.columns_of(k)])
             for k, (run, part) in enumerate(zip(runs, system.parts, strict=True))
         ),
         notes=tuple(
-            f"{n.name} not observable in these runs: sigma {_readable(n.name, n.sigma)}"
+            f"{n.name} not observable in these runs: sigma {_format_parameter(n.name, n.sigma)}"
             for n in parameters
-            if n.name.split("_")[0] in extra and not n.seen
+            if n.name.split("_")[0] in extra and not n.observable
         ),
     )
 
 
 def _check_pivot(system: NormalEquations, chi_square: float, freedom: int) -> None:
-    """Refuse a pivot that the data contradict: one for each rotation must not explain much more."""
-    runs, cut = len(system.parts), 9 + system.unknowns.shared
-    own = np.split(system.unknowns.sigma[system.unknowns.shared :], runs)
+    """Refuse a pivot that the data contradict: a separate one for each rotation fits much better."""
+    runs, cut = len(system.parts), 9 + system.parameters.shared
+    own = np.split(system.parameters.sigma[system.parameters.shared :], runs)
     sigma = np.concatenate([np.append(phi, np.full(3, PIVOT_SIGMA)) for phi in own])
     size = cut + len(own[0])
-    M = np.zeros((size, size + 3))  # a shift of the origin is one of all three points
+    M = np.zeros((size, size + 3))  # a shift of the origin shifts all three points
     M[:, :size], M[:9, size:] = np.eye(size), np.tile(np.eye(3), (3, 1))
-    apart = NormalEquations(
+    separate = NormalEquations(
         [
             part._replace(columns=part.columns @ M, N=M.T @ part.N @ M, b=M.T @ part.b)
             for part in system.parts
         ],
-        Parameters((), np.concatenate([system.unknowns.sigma[: system.unknowns.shared], sigma]), cut - 9),
+        Parameters((), np.concatenate([system.parameters.sigma[: system.parameters.shared], sigma]), cut - 9),
     )
-    x, _ = apart.solve(np.eye(9))
-    better, _ = apart.chi_square(x, 9)
+    x, _ = separate.solve(np.eye(9))
+    better, _ = separate.chi_square(x, 9)
     if chi_square - better > PIVOT_LIMIT * 3 * runs or chi_square > CHI_SQUARE_LIMIT * freedom:
         raise InputError(
             "identification: pivot fixed: expected the origin of b to stay still, but the velocities "
@@ -185,17 +183,18 @@ def _check_pivot(system: NormalEquations, chi_square: float, freedom: int) -> No
         )
 
 
-def _left_out(
-    system: NormalEquations, k: int, label: str, x: Array, basis: Array, least: float
+def _without(
+    system: NormalEquations, k: int, label: str, x: Array, basis: Array, limit: float
 ) -> LeaveOneOut:
+    """Return the estimate without run k."""
     other = system.without(k)
-    rank = int((other.directions()[0] < least).sum())
+    rank = int((other.directions()[0] < limit).sum())
     if rank < basis.shape[1]:
         return LeaveOneOut(label, rank, None)
     return LeaveOneOut(label, rank, (other.solve(basis)[0] - x)[:9].reshape(3, 3))
 
 
-def _readable(name: str, value: float) -> str:
+def _format_parameter(name: str, value: float) -> str:
     if name.startswith("skew"):
         return f"{value * 1e3:.3g} ms"
     return f"{value * STANDARD_GRAVITY**2 / UG:.3g} ug/g^2"

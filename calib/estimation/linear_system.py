@@ -19,44 +19,44 @@ from imudrv.nav.earth import earth_rate_n
 from imudrv.units import MM, NS
 
 ROWS_PER_BIN: Final = round(BIN_S / (BLOCK_NS * NS))
-"""Rows at rest that make one equation."""
+"""Rows at rest that are averaged into one equation."""
 
 
 ROWS_PER_POINT: Final = 5
-"""With a known pivot each so-manieth row of the motion is an equation too."""
+"""With a known pivot, every n-th row during the motion also becomes an equation."""
 
 
 GAIN_WINDOW_S: Final = 0.5
-"""`plain` takes the mean velocity over so long after the rotation, s."""
+"""Averaging window for the velocity before and after the rotation, s."""
 
 
 OWN_RATIO: Final = 2.0
-"""White noise of a rest counts as its own when it is so much more than that of all."""
+"""A rest whose white noise exceeds the pooled value by this factor keeps its own."""
 
 
 TILT_SIGMA: Final = 5e-3
-"""Prior of the tilts at a run's start, rad: none, for a run's own rest tells them."""
+"""Prior sigma of the initial tilts, rad; wide, because the rest before the rotation determines them."""
 
 
 LEAST_NOISE: Final = Noise(angle_walk=1e-7, velocity_walk=1e-6, velocity_white=3e-6, velocity_pulse=3e-5)
-"""What linear equations leave out: no noise is taken to be smaller."""
+"""Lower bound of the noise, for the effects that linear equations neglect."""
 
 
 ROUNDING: Final = 1e-7
-"""A direction seen so much worse than the best one is not told from rounding."""
+"""Directions weaker than the best by this factor are below numerical precision."""
 
 
 class Parameters(NamedTuple):
-    """Names and priors of a session's unknowns but R, in the order of their columns.
+    """Names and priors of a session's parameters other than R, in the order of their columns.
 
     Attributes
     ----------
     names : tuple of str
         Such as 'accelerometer_bias_x'.
     sigma : ndarray, shape (n,)
-        Priors, SI.
+        Prior sigmas, SI.
     shared : int
-        So many are common to all runs; behind them come those of the first run, the second, ...
+        Number of parameters common to all runs; those of the first run, the second, ... follow.
     """
 
     names: tuple[str, ...]
@@ -64,14 +64,14 @@ class Parameters(NamedTuple):
     shared: int
 
     def columns_of(self, k: int, runs: int) -> NDArray[np.int64]:
-        """Places, R first, of the unknowns that run k of so many depends on."""
+        """Return the columns, R first, of the parameters of run k of `runs`."""
         own = (len(self.sigma) - self.shared) // runs
         shared = 9 + self.shared
         return np.concatenate([np.arange(shared), shared + own * k + np.arange(own)])
 
 
 class RunEquations(NamedTuple):
-    """A run's equations `v = columns @ (R, shared, phi_0)`, and their whitened sums."""
+    """Equations of a run, `v = columns @ (R, shared, phi_0)`, and their whitened sums."""
 
     t_s: Array  # (n,)
     v_n: Array  # (n, 2), or (n, 3) with a known pivot
@@ -82,26 +82,26 @@ class RunEquations(NamedTuple):
 
 
 class NormalEquations:
-    """Normal equations of a session; the unknowns are R, what all runs share, and phi_0 of each run."""
+    """Normal equations of a session for R, the parameters common to all runs, and phi_0 of each run."""
 
-    def __init__(self, parts: Sequence[RunEquations], unknowns: Parameters) -> None:
-        self.parts, self.unknowns = parts, unknowns
-        self.scale = np.concatenate([np.full(9, 0.1), unknowns.sigma])
+    def __init__(self, parts: Sequence[RunEquations], parameters: Parameters) -> None:
+        self.parts, self.parameters = parts, parameters
+        self.scale = np.concatenate([np.full(9, 0.1), parameters.sigma])
         n = len(self.scale)
-        self.N, self.b = np.diag(np.concatenate([np.zeros(9), unknowns.sigma**-2])), np.zeros(n)
+        self.N, self.b = np.diag(np.concatenate([np.zeros(9), parameters.sigma**-2])), np.zeros(n)
         for k, part in enumerate(parts):
             at = self.columns_of(k)
             self.N[np.ix_(at, at)] += part.N
             self.b[at] += part.b
 
     def columns_of(self, k: int) -> NDArray[np.int64]:
-        """Places of a run's unknowns among all."""
-        return self.unknowns.columns_of(k, len(self.parts))
+        """Return the columns of a run's parameters."""
+        return self.parameters.columns_of(k, len(self.parts))
 
     def without(self, k: int) -> "NormalEquations":
-        """The same without a run's data."""
+        """Return the equations without the data of a run."""
         other = object.__new__(NormalEquations)
-        other.parts, other.unknowns, other.scale = self.parts, self.unknowns, self.scale
+        other.parts, other.parameters, other.scale = self.parts, self.parameters, self.scale
         other.N, other.b = self.N.copy(), self.b.copy()
         at = self.columns_of(k)
         other.N[np.ix_(at, at)] -= self.parts[k].N
@@ -109,7 +109,7 @@ class NormalEquations:
         return other
 
     def directions(self) -> tuple[Array, Array]:
-        """1-sigma of the principal directions of R, best first, and the directions, (9, 9), as columns."""
+        """Return 1-sigma of the principal directions of R, best first, and the directions as columns."""
         N = self.N * np.outer(self.scale, self.scale)
         information = N[:9, :9] - N[:9, 9:] @ np.linalg.solve(N[9:, 9:], N[9:, :9])
         values, vectors = np.linalg.eigh(0.5 * (information + information.T))
@@ -117,7 +117,7 @@ class NormalEquations:
         return self.scale[0] / np.sqrt(np.maximum(values[::-1], least)), vectors[:, ::-1]
 
     def solve(self, basis: Array) -> tuple[Array, Array]:
-        """Estimate and covariance of all unknowns, R within `basis`."""
+        """Return estimate and covariance of all parameters, R within the span of `basis`."""
         n = len(self.scale)
         T = np.zeros((n, n - 9 + basis.shape[1]))
         T[:9, : basis.shape[1]], T[9:, basis.shape[1] :] = basis, np.eye(n - 9)
@@ -126,7 +126,7 @@ class NormalEquations:
         return covariance @ self.b, covariance
 
     def chi_square(self, x: Array, of_R: int) -> tuple[float, int]:
-        """Chi-square of residuals and priors, and degrees of freedom: each prior pays for its unknown."""
+        """Return chi-square of residuals and priors, and degrees of freedom; each prior is an equation."""
         yy = sum(part.yy for part in self.parts)
         count = sum(part.v_n.size for part in self.parts)
         return float(yy - 2.0 * self.b @ x + x @ self.N @ x), count - of_R
@@ -162,30 +162,29 @@ def prior_parameters(runs: Sequence[Run], priors: Priors, terms: Sequence[str]) 
 
 
 def rest_noise(runs: Sequence[Run]) -> Noise:
-    """Noise of all rests of the runs, each taken once."""
+    """Return the noise of all rests of the runs, each counted once."""
     rests = {
         (run.label.rpartition("#")[0], rest.start): rest
         for run in runs
         for rest in (run.rotation.before, run.rotation.after)
-        if rest is not None
     }
     found = vars(pooled_noise(rest.differences for rest in rests.values()))
     return Noise(**{name: max(value, getattr(LEAST_NOISE, name)) for name, value in found.items()})
 
 
-def bin_variance(rest: Rest | None, noise: Noise) -> float:
-    """What a bin's mean varies by beside the random walk to its middle.
+def bin_variance(rest: Rest, noise: Noise) -> float:
+    """Return the variance of a bin's mean beyond that of the random walk to its middle.
 
-    White noise is a rest's own where that is much more: a level accelerometer with a pulse a second or less
+    A rest with much more white noise keeps its own: a level accelerometer with at most one pulse per second
     does not average out in a bin. The mean of a random walk varies less than its value in the middle.
     """
-    own = rest.noise.velocity_white if rest is not None and rest.noise is not None else 0.0
+    own = rest.noise.velocity_white if rest.noise is not None else 0.0
     white = own if own > OWN_RATIO * noise.velocity_white else noise.velocity_white
     return white**2 - noise.velocity_walk**2 * BIN_S / 6.0
 
 
 def noise_covariance(t: Array, single: Array, noise: Noise, gravity: float) -> Array:
-    """Covariance of velocities of one axis at the times t; `single` is each one's own variance."""
+    """Return the covariance of velocities of one axis at the times t; `single`: independent variances."""
     s, u = np.minimum.outer(t, t), np.maximum.outer(t, t)
     walk, tilt = noise.velocity_walk**2, (gravity * noise.angle_walk) ** 2
     K = walk * s + tilt * s * s * (3.0 * u - s) / 6.0 + noise.velocity_pulse**2 + np.diag(single)
@@ -193,7 +192,7 @@ def noise_covariance(t: Array, single: Array, noise: Noise, gravity: float) -> A
 
 
 def design_columns(run: Run, terms: Sequence[str]) -> Array:
-    """What each row's velocity owes to R, to what is shared, and to phi_0: (n, 3, 9 + shared + 3)."""
+    """Return the derivatives of velocity by R, shared parameters and phi_0, (n, 3, 9 + shared + 3)."""
     rows, t = run.rows, run.t_s
     C_nb = Attitude.from_quat(np.roll(rows["q_nb"], -1, axis=1)).as_matrix()
     dt = np.diff(t, prepend=0.0)
@@ -222,12 +221,12 @@ def design_columns(run: Run, terms: Sequence[str]) -> Array:
 
 
 def _skew_column(run: Run, C_nb: Array, f_n: Array, f_b: Array) -> Array:
-    """What a skew s does; felt is `f_b(t + s)`, so that velocity gains s times the sum of these.
+    """Return the derivative of the velocity by a skew s: the accelerometers sense `f_b(t + s)`.
 
         integral of C_nb df_b = f_n(t) - f_n(0) - integral of dC_nb f_b
 
-    At rest the first two cancel. In motion f_n is the mean of the rows beside, for a row's own noise is in
-    the velocity that it explains.
+    At rest the first two cancel. In motion f_n is the mean of the adjacent rows, because a row's own noise is
+    also in its velocity.
     """
     moving = ~(run.before | run.after)
     column = -np.cumsum(np.einsum("nij,nj->ni", np.diff(C_nb, axis=0, prepend=C_nb[:1]), f_b), axis=0)
@@ -237,10 +236,10 @@ def _skew_column(run: Run, C_nb: Array, f_n: Array, f_b: Array) -> Array:
 
 
 def _settled_H(run: Run, coriolis: Array) -> Array:
-    """H of each row, at rest without the noise of the rate at a row's end.
+    """Return H of each row, at rest without the noise of the rate at a row's end.
 
-    At rest H does not change, but for Coriolis' acceleration, and before the motion it is zero. That noise,
-    up to 2e-3 m/s a metre in a single row, would pass for a signal of the gauge.
+    At rest H is constant except for the Coriolis acceleration; before the motion it is zero. That noise, up
+    to 2e-3 m/s per metre in a single row, would look like a signal of the gauge.
     """
     H = run.rows["H"].copy()
     H[run.before] = 0.0
@@ -252,14 +251,14 @@ def _settled_H(run: Run, coriolis: Array) -> Array:
 
 
 def _tilted(phi: Array, gravity: float) -> Array:
-    """`f_n x phi` for columns phi, (n, 3, m), in a body that does not accelerate."""
+    """Return `f_n x phi` for columns phi, (n, 3, m), of a body that does not accelerate."""
     out = np.zeros_like(phi)
     out[:, 0], out[:, 1] = -gravity * phi[:, 1], gravity * phi[:, 0]
     return out
 
 
 def run_equations(run: Run, noise: Noise, pivot: str, terms: Sequence[str]) -> RunEquations:
-    """Bins of the rests; with a known pivot points of the motion, and the vertical, too."""
+    """Return the equations of the rests; with a known pivot also of the motion and the vertical."""
     parts = 3 if pivot == "fixed" else 2
     rows = [whole_bins(run.before, True), whole_bins(run.after, False)]
     if pivot == "fixed":
@@ -282,7 +281,7 @@ def run_equations(run: Run, noise: Noise, pivot: str, terms: Sequence[str]) -> R
 
 
 def whole_bins(mask: NDArray[np.bool_], from_the_end: bool) -> NDArray[np.int64]:
-    """Rows of each whole bin, (bins, rows a bin); what is over lies far from the rotation."""
+    """Return the rows of each whole bin, (bins, rows per bin); surplus rows are far from the rotation."""
     at = np.flatnonzero(mask)
     over = len(at) % ROWS_PER_BIN
     at = at[over:] if from_the_end else at[: len(at) - over]
@@ -290,7 +289,7 @@ def whole_bins(mask: NDArray[np.bool_], from_the_end: bool) -> NDArray[np.int64]
 
 
 def velocity_gain(run: Run) -> tuple[Array, Array]:
-    """V and H that a rotation has gained: means over the half second after it less those before it."""
+    """Return the gains V and H of a rotation: means over the half second after minus those before."""
     before, after = gain_rows(run)
     rows = run.rows
     V = run.v_n[after].mean(axis=0) - run.v_n[before].mean(axis=0)
@@ -304,7 +303,7 @@ def gain_rows(run: Run) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 
 def velocity_at_rest(run: Run, R: Array) -> tuple[Array, Array, Array]:
-    """Times, velocities and H R of the bins at rest."""
+    """Return times, velocities and H R of the bins at rest."""
     at = np.concatenate([whole_bins(run.before, True), whole_bins(run.after, False)])
     rows = run.rows[at]
     return (
@@ -315,7 +314,7 @@ def velocity_at_rest(run: Run, R: Array) -> tuple[Array, Array, Array]:
 
 
 def run_result(run: Run, V: Array, H: Array, R: Array, t_s: Array, v_n: Array, fitted_n: Array) -> RunResult:
-    """Return one rotation as the result shows it."""
+    """Return the result of one rotation."""
     rotation = run.rotation
     H_rest = run.rows["H"][gain_rows(run)[0], :2].mean(axis=0)
     return RunResult(
@@ -332,38 +331,39 @@ def run_result(run: Run, V: Array, H: Array, R: Array, t_s: Array, v_n: Array, f
     )
 
 
-def singular_values_of(told: Sequence[tuple[Array, Array]]) -> Array:
+def singular_values_of(gains: Sequence[tuple[Array, Array]]) -> Array:
     """Return the singular values of the stacked horizontal H, nine of them."""
     s = np.zeros(9)
-    H = np.concatenate([h[:2] for _, h in told])
+    H = np.concatenate([h[:2] for _, h in gains])
     s[: min(H.shape)] = np.linalg.svd(H, compute_uv=False)
     return s
 
 
-def rank_reason(rank: int, worst: float, sigma: Array, least: float) -> str:
+def rank_reason(rank: int, sigma: Array, limit: float) -> str:
     """Return the reason for the rank, in words."""
-    seen = f"rank {rank}: the directions seen have a sigma of {worst / MM:.3g} mm or less"
+    observable = (
+        f"rank {rank}: the observable directions have a sigma of at most {sigma[rank - 1] / MM:.3g} mm"
+    )
     if rank == 9:
-        return seen
-    return f"{seen}, the next {sigma[rank] / MM:.3g} mm, where {least / MM:g} mm counts as not seen"
+        return observable
+    return f"{observable}, the next one {sigma[rank] / MM:.3g} mm; the limit is {limit / MM:g} mm"
 
 
-def unobservable_text(sigma: Array, directions: Array, basis: Array, least: float) -> str:
-    """Message for rotations that do not see what is wanted; names the directions."""
+def unobservable_text(sigma: Array, directions: Array, basis: Array, limit: float) -> str:
+    """Return the message for rotations that do not determine R; names the directions."""
     wanted = basis.shape[1]
-    rank = min(wanted, int((sigma < least).sum()))
-    inside = basis @ basis.T @ directions[:, sigma >= least]
-    left, size, _ = np.linalg.svd(inside, full_matrices=False)
-    unseen = left[:, size > 0.5]
-    names = "; ".join(_direction(d) for d in unseen.T)
+    rank = min(wanted, int((sigma < limit).sum()))
+    inside = basis @ basis.T @ directions[:, sigma >= limit]
+    vectors, size, _ = np.linalg.svd(inside, full_matrices=False)
+    names = "; ".join(_direction(d) for d in vectors[:, size > 0.5].T)
     return (
-        f"identification: expected rotations that see {wanted} directions of the lever arms, got {rank}; not "
-        f"seen to {least / MM:g} mm: {names}; add rotations with another axis up"
+        f"identification: expected rotations that determine {wanted} directions of the lever arms, "
+        f"got {rank}; unobservable to {limit / MM:g} mm: {names}; add rotations with another axis up"
     )
 
 
 def _direction(d: Array) -> str:
-    """Such as '+0.71 x_Z -0.71 y_Z': components of r_x, r_y and r_z along body axes."""
+    """Return a direction as text: '+0.71 x_Z -0.71 y_Z', components of r_x, r_y, r_z along body axes."""
     terms = [f"{a}_{b}" for a in "xyz" for b in "XYZ"]
     d = d * np.sign(d[np.argmax(np.abs(d))])
     return " ".join(f"{value:+.2f} {term}" for value, term in zip(d, terms, strict=True) if abs(value) > 0.1)
@@ -373,10 +373,10 @@ def require_runs(runs: Sequence[Run]) -> None:
     """Raise `InputError` unless there is a run."""
     if not runs:
         raise InputError(
-            "identification: expected one good rotation at least, got none; see why they were rejected"
+            "identification: expected at least one accepted rotation, got none; see why they were rejected"
         )
 
 
 def parameter_groups(priors: Priors, extra: Sequence[Extra]) -> tuple[str, ...]:
-    """Terms beside biases and matrices: skew, unless it is known to be none, and what is asked for."""
+    """Return the parameters beyond biases and matrices: skew, unless known to be none, and the extra ones."""
     return (*(("skew",) if priors.skew else ()), *extra)

@@ -1,25 +1,23 @@
 """Low-pass filter of the angle increments, which removes the dither of the gyro blocks.
 
-A block that dithers turns against the case; the accelerometers do not feel it. What is left of it in the
-increments is no rotation of the body: the squared rates of H rectify it, 32 m/s per m in ten seconds for 100
-arcsec at 400 Hz. The filter is that of `imudrv.imu.rate_filter`, ``dither``, as the mean of the rates at both
-ends of an interval: linear phase, no lag, sum 1, so that the angle turned stays what it was.
+A dithering block rotates relative to the case; the accelerometers do not sense it. Its residue in the
+increments is not a rotation of the body: the squared rates in H rectify it, 32 m/s per m in ten seconds for
+100 arcsec at 400 Hz. The filter is ``dither`` of `imudrv.imu.rate_filter`, as the mean of the rates at both
+ends of an interval: linear phase, no lag, sum 1, so that the total angle is unchanged.
 """
 
 from collections.abc import Iterable, Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from imudrv.arrays import Array
 from imudrv.errors import InputError
 from imudrv.imu.rate_filter import rate_filter
 from imudrv.records import INCREMENTS, Records
 
-Array = NDArray[np.float64]
-
 
 def without_dither(pieces: Iterable[Records]) -> Iterator[Records]:
-    """Low-pass filter the angle increments of a capture; any pieces give the same bits.
+    """Low-pass filter the angle increments of a capture; bits do not depend on how it is divided.
 
     Parameters
     ----------
@@ -29,8 +27,8 @@ def without_dither(pieces: Iterable[Records]) -> Iterator[Records]:
     Yields
     ------
     ndarray of INCREMENTS
-        The rows but for the first and last eight. Beside a gap, and everywhere at a sample rate that aliases
-        the dither into the motion, rows are as they came.
+        All rows except the first and last eight. Next to a gap, and everywhere at a sample rate that aliases
+        the dither into the motion, rows are unchanged.
     """
     rows, taps, done = np.zeros(0, INCREMENTS), None, 0
     for piece in pieces:
@@ -47,7 +45,7 @@ def without_dither(pieces: Iterable[Records]) -> Iterator[Records]:
 
 
 def _taps(interval_ns: int) -> Array:
-    """Weights of the angle increments around an interval; one weight at rates that the filter is not for."""
+    """Return the weights of the angle increments; a single one at sample rates without a filter."""
     try:
         return np.convolve(rate_filter("dither", interval_ns).taps, (0.5, 0.5))
     except InputError:
@@ -55,7 +53,7 @@ def _taps(interval_ns: int) -> Array:
 
 
 def _filtered(rows: Records, taps: Array) -> Records:
-    """Filter the angle where all neighbours are there."""
+    """Filter the angle where no neighbour is missing."""
     out, n = rows.copy(), len(rows) - len(taps) + 1
     if n < 1 or len(taps) == 1:
         return out

@@ -8,9 +8,10 @@ from typing import Final
 import numpy as np
 from scipy.spatial.transform import Rotation as Attitude
 
+from calib.detection.acceptance import AcceptedRotation
 from calib.detection.blocks import BLOCK_NS
 from calib.detection.noise import Noise
-from calib.detection.segments import Rotation
+from calib.detection.segments import Rest
 from calib.estimation.linear_system import (
     GAIN_WINDOW_S,
     NormalEquations,
@@ -21,20 +22,21 @@ from calib.estimation.linear_system import (
 )
 from calib.estimation.result import CENTROID_BASIS, TO_DIFFERENCES
 from calib.estimation.runs import AFTER_S, BEFORE_S, GUARD_S, Priors, Run
+from calib.html_table import html_table
 from imudrv.arrays import Array
 from imudrv.errors import InputError
 from imudrv.nav.alignment import ALIGNMENT_S, Aligned
 from imudrv.nav.earth import earth_rate_n, normal_gravity
 from imudrv.nav.mechanisation import Navigator
 from imudrv.records import INCREMENTS
-from imudrv.units import DEG, NS
+from imudrv.units import DEG, MM, NS
 
 _PLAN_INTERVAL_NS: Final = 5_000_000
 
 
 @dataclass(frozen=True)
 class PlannedRotation:
-    """A rotation that is planned.
+    """A planned rotation.
 
     Attributes
     ----------
@@ -43,11 +45,11 @@ class PlannedRotation:
     angle_deg : float
         Right-handed about up.
     duration_s : float
-        From rest to rest, with least jerk.
+        Duration from rest to rest, with minimum jerk.
     after_s : float
-        Rest after it.
+        Duration of the rest after it.
     offset_m : float
-        Distance of the origin of b from the axis of the rotation, through which a skew acts.
+        Distance of the origin of b from the rotation axis; the effect of a skew is proportional to it.
     """
 
     up: str
@@ -57,14 +59,14 @@ class PlannedRotation:
     offset_m: float = 0.05
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Prediction:
-    """What a plan will give.
+    """Predicted accuracy of a plan.
 
     Attributes
     ----------
     covariance : ndarray, shape (9, 9)
-        Of (r_x, r_y, r_z) in gauge centroid, m^2.
+        Covariance of (r_x, r_y, r_z) in gauge centroid, m^2.
     differences_sigma : ndarray, shape (2, 3)
         1-sigma of `r_x - r_y` and `r_x - r_z`, m.
     """
@@ -72,22 +74,32 @@ class Prediction:
     covariance: Array
     differences_sigma: Array
 
+    def __repr__(self) -> str:
+        return f"<Prediction: sigma of the differences up to {self.differences_sigma.max() / MM:.3f} mm>"
+
+    def _repr_html_(self) -> str:
+        rows = [
+            (name, *(f"{value:.3f}" for value in sigma))
+            for name, sigma in zip(("r_x - r_y", "r_x - r_z"), self.differences_sigma / MM, strict=True)
+        ]
+        return html_table("Predicted sigma of the differences", ("mm", "X", "Y", "Z"), rows)
+
 
 def predict(
     plan: Sequence[PlannedRotation], latitude_rad: float, noise: Noise, priors: Priors | None = None
 ) -> Prediction:
-    """Covariance that a plan will give, from an ideal motion and without data.
+    """Predict the covariance of the lever arms from an ideal motion, without data.
 
     Parameters
     ----------
-    plan : sequence of Planned
+    plan : sequence of PlannedRotation
         The rotations.
     latitude_rad : float
-        Of the place.
+        Geodetic latitude.
     noise : Noise
-        Of the sensors, as an earlier session found it.
+        Noise of the sensors, such as that of an earlier session.
     priors : Priors, optional
-        What the static calibration leaves.
+        Uncertainty of the static calibration.
 
     Returns
     -------
@@ -96,11 +108,11 @@ def predict(
     Raises
     ------
     InputError
-        An empty plan, or one that does not see the six differences; says which it does not see.
+        The plan is empty, or does not determine the six differences; names the unobservable directions.
     """
     priors = priors or Priors()
     if not plan:
-        raise InputError("plan: expected one rotation at least, got none")
+        raise InputError("plan: expected at least one rotation, got none")
     runs = [_planned_run(planned, k, latitude_rad, priors) for k, planned in enumerate(plan)]
     terms = parameter_groups(priors, ())
     system = NormalEquations(
@@ -115,15 +127,15 @@ def predict(
 
 
 def _planned_run(planned: PlannedRotation, k: int, latitude_rad: float, priors: Priors) -> Run:
-    """The run that a planned rotation would make: level, about the vertical, nothing in error."""
+    """Return the ideal run of a planned rotation: level, about the vertical, without errors."""
     T, n = _PLAN_INTERVAL_NS * NS, round(planned.duration_s / (_PLAN_INTERVAL_NS * NS))
     before, after = round(BEFORE_S / T), round(min(planned.after_s, AFTER_S) / T)
     up_b = np.array([planned.up == f"+{a}" for a in "XYZ"], np.float64)
     up_b -= [planned.up == f"-{a}" for a in "XYZ"]
     if not up_b.any() or n < 1 or after * T < GAIN_WINDOW_S:
         raise InputError(
-            f"plan: expected an axis up from +X to -Z, a duration, and a rest of "
-            f"{GAIN_WINDOW_S:g} s at least, got {planned}"
+            f"plan: expected an axis up from +X to -Z, a duration, and a rest of at "
+            f"least {GAIN_WINDOW_S:g} s, got {planned}"
         )
     u = np.clip((np.arange(before + n + after + 1) - before) / n, 0.0, 1.0)
     angle = planned.angle_deg * DEG * u**3 * (10.0 - 15.0 * u + 6.0 * u * u)
@@ -150,8 +162,9 @@ def _planned_run(planned: PlannedRotation, k: int, latitude_rad: float, priors: 
         priors.gyro_bias / earth_rate_n(latitude_rad)[1],
         tan(latitude_rad) * priors.accelerometer_bias / gravity,
     )
-    rotation = Rotation(
-        before, before + n, before * T, (before + n) * T, None, None, planned.angle_deg, planned.up,
+    rest = Rest(0, before, 0.0, before * T, planned.up, up_b, gravity * up_b, None, 0)
+    rotation = AcceptedRotation(
+        before, before + n, before * T, (before + n) * T, rest, rest, planned.angle_deg, planned.up,
         planned.up[1], 0.0, 0.0, 0, 0,
     )  # fmt: skip
     return Run(

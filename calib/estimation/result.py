@@ -1,4 +1,4 @@
-"""The estimate of the lever arms, and what it consists of."""
+"""Result of the estimation of the lever arms."""
 
 from dataclasses import dataclass
 from typing import Final, Literal
@@ -12,11 +12,11 @@ Extra = Literal["quadratic"]
 
 
 CHI_SQUARE_LIMIT: Final = 2.0
-"""Chi-square per degree of freedom from which data contradict the model."""
+"""Reduced chi-square above which the data contradict the model."""
 
 
 OBSERVABLE_RATIO: Final = 0.5
-"""An extra unknown whose sigma is not below this part of its prior is not seen."""
+"""A parameter is unobservable if its posterior sigma exceeds this fraction of its prior."""
 
 
 def _shift_free() -> Array:
@@ -34,14 +34,14 @@ TO_DIFFERENCES: Final = np.kron([[1.0, -1.0, 0.0], [1.0, 0.0, -1.0]], np.eye(3))
 
 @dataclass(frozen=True)
 class ParameterEstimate:
-    """An unknown beside R, SI.
+    """Estimate of a parameter other than R, SI.
 
     Attributes
     ----------
     name : str
         Such as 'accelerometer_bias_x'.
     value, sigma, prior : float
-        Estimate, its sigma, and the sigma it had before.
+        Estimate, its posterior sigma and its prior sigma.
     """
 
     name: str
@@ -50,37 +50,37 @@ class ParameterEstimate:
     prior: float
 
     @property
-    def seen(self) -> bool:
-        """Whether the data tell more than the prior."""
+    def observable(self) -> bool:
+        """Whether the data determine the parameter better than the prior."""
         return self.sigma < OBSERVABLE_RATIO * self.prior
 
 
 @dataclass(frozen=True)
 class RunResult:
-    """One rotation in the light of the result.
+    """Velocity of one rotation and its fit.
 
     Attributes
     ----------
     label : str
-        Of the run.
+        Label of the run.
     axis : str
         Body axis that was up, '+X' to '-Z'.
     angle_deg : float
-        Turned, right-handed about up.
+        Angle, right-handed about up.
     V_n : ndarray, shape (3,)
-        Velocity gained by the rotation, the mean over half a second after it less that before it, east,
-        north, up, m/s.
+        Velocity gain of the rotation: mean over half a second after it minus that before it, east, north,
+        up, m/s.
     H : ndarray, shape (3, 9)
-        The same of the measurement matrix.
+        The same difference of the measurement matrix.
     compensated_n : ndarray, shape (3,)
         `V_n - H R`.
     H_rest : float
-        Largest horizontal element of H at the end of the rest before, m/s per m: 0 in theory. Dither or
-        vibration left in the gyros' increments is rectified by the squared rates and makes it grow.
+        Largest horizontal element of H at the end of the rest before, m/s per m: 0 in theory. The squared
+        rates rectify residual dither or vibration in the gyros' increments, which makes it grow.
     t_s : ndarray, shape (n,)
         Middle of each bin at rest, from the start of navigation.
     v_n, fitted_n : ndarray, shape (n, 2)
-        Velocity in the bin, east and north, and what the estimate says of it, m/s; `plain`: `H R` alone.
+        Mean velocity of each bin, east and north, and its fit, m/s; method `plain`: `H R` alone.
     """
 
     label: str
@@ -102,11 +102,11 @@ class LeaveOneOut:
     Attributes
     ----------
     label : str
-        Of the run left out.
+        Label of the run left out.
     rank : int
-        Directions still seen.
+        Number of directions that remain observable.
     shift_m : ndarray, shape (3, 3), or None
-        R without it minus R with it; None: the others do not see enough.
+        R without it minus R with it; None: the other runs do not determine R.
     """
 
     label: str
@@ -116,40 +116,40 @@ class LeaveOneOut:
 
 @dataclass(frozen=True)
 class LeverArmEstimate:
-    """The inner lever arms.
+    """Estimate of the inner lever arms.
 
     Attributes
     ----------
     method : {'joint', 'plain'}
-        How they were found.
+        Estimator.
     gauge : {'centroid', 'given'}
         `given`: the origin of b is the pivot.
     R_b : ndarray, shape (3, 3)
         Row i: sensing point of accelerometer i, m, body axes.
     covariance : ndarray, shape (9, 9)
-        Of (r_x, r_y, r_z), m^2; rank 6, with a known pivot 9.
+        Covariance of (r_x, r_y, r_z), m^2; rank 6, with a known pivot 9.
     rank : int
-        Directions of R that the data see.
+        Number of observable directions of R.
     direction_sigma : ndarray, shape (9,)
         1-sigma of each principal direction of R, m, best first.
     singular_values : ndarray, shape (9,)
-        Of the stacked horizontal H after the rotations, m/s a metre.
+        Singular values of the stacked horizontal H after the rotations, m/s per m.
     reason : str
-        Why the rank is what it is.
+        Explanation of the rank.
     chi_square, degrees_of_freedom : float, int
-        Of the whitened residuals and the priors; `plain`: of V = H R.
+        Of the whitened residuals and the priors; method `plain`: of V = H R.
     noise : Noise
-        Of the sensors, from the rests.
-    nuisances : tuple of Nuisance
-        All else that was estimated.
+        Noise of the sensors, from the rests.
+    parameters : tuple of ParameterEstimate
+        All other parameters.
     correlation : ndarray, shape (9, n)
-        Of R with the nuisances.
-    left_out : tuple of LeftOut
-        Stability: each rotation left out in turn.
+        Correlation of R with the parameters.
+    leave_one_out : tuple of LeaveOneOut
+        The estimate without each rotation in turn.
     runs : tuple of RunResult
         Each rotation.
     notes : tuple of str
-        What a reader has to know.
+        Remarks for the reader.
     """
 
     method: Literal["joint", "plain"]
@@ -195,18 +195,18 @@ class LeverArmEstimate:
 
     @property
     def consistent(self) -> bool:
-        """Whether chi-square is one that the model allows; without degrees of freedom nothing can differ."""
+        """Whether the model allows this chi-square; without degrees of freedom it always does."""
         return self.chi_square <= CHI_SQUARE_LIMIT * self.degrees_of_freedom or not self.degrees_of_freedom
 
     @property
     def refusals(self) -> tuple[str, ...]:
-        """Why no certificate may be made of the result, with what to do; empty: one may."""
+        """Reasons against a certificate from this result, with what to do; empty: none."""
         refusals = []
         if not self.consistent:
             refusals.append(
                 f"the velocities contradict the model: expected chi-square of about "
                 f"{self.degrees_of_freedom}, got {self.chi_square:.0f}; the report's figures show which "
-                "rotation stands out: leave it out, or look for what moved"
+                "rotation deviates: leave it out, or look for what moved"
             )
         worst = max(self.runs, key=lambda run: run.H_rest)
         if worst.H_rest > REST_H_LIMIT:

@@ -1,46 +1,45 @@
-"""Evidence: for every rotation that serves, velocity and its matrices over rest, rotation and rest.
+"""Align and navigate each accepted rotation: velocity and its measurement matrices.
 
-Each rotation is a run of its own: aligned on the rest before it but for its last seconds, then navigated from
-zero velocity through the end of that rest, the rotation, and the rest after, with the dither of the gyro
-blocks filtered from the angle increments. A capture is read twice: the first pass finds the segments, the
-second aligns and navigates as the increments come by, so that memory stays that of a chunk and of the rows
-kept.
+Each rotation is one run. It is aligned on the rest before it, except the last seconds of that rest, then
+navigated from zero velocity through the end of that rest, the rotation, and the rest after. The dither of the
+gyro blocks is filtered from the angle increments. A capture is read twice: the first pass finds the segments,
+the second aligns and navigates, so that memory holds one chunk and the rows kept.
 """
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calib.detection.acceptance import RotationLimits, rejection_reasons
+from calib.detection.acceptance import AcceptedRotation, RejectedRotation, RotationLimits, assess
 from calib.detection.blocks import BLOCK_NS
-from calib.detection.segments import Rotation, Segments, find_segments
+from calib.detection.segments import Segments, find_segments
 from calib.estimation.low_pass import without_dither
 from imudrv.arrays import Array
+from imudrv.errors import InputError
 from imudrv.nav.alignment import ALIGNMENT_S, MIN_ALIGNMENT_S, Aligned, Alignment
-from imudrv.nav.earth import normal_gravity
-from imudrv.nav.mechanisation import MEASUREMENT, Navigator
+from imudrv.nav.mechanisation import Navigator
 from imudrv.records import Records
 from imudrv.site import Site
 from imudrv.units import DEG_PER_H, MM, NS, PPM, STANDARD_GRAVITY, UG, URAD
 
 BEFORE_S: Final = 10.0
-"""Rest that is navigated before the rotation, s."""
+"""Length of the rest before the rotation that is navigated, s."""
 
 
 AFTER_S: Final = 15.0
-"""Most of the rest after it that is navigated, s."""
+"""Maximum length of the rest after the rotation that is navigated, s."""
 
 
 GUARD_S: Final = 0.1
-"""So near to the rotation rest is not used: its very ends are too slow to be told from rest, s."""
+"""Margin of each rest next to the rotation that is not used, s: a rotation ends too slowly."""
 
 
 @dataclass(frozen=True)
 class Priors:
-    """What is known of the unit before: 1-sigma of what its static calibration leaves.
+    """Prior uncertainty of the unit: 1-sigma of the residual errors of its static calibration.
 
     Attributes
     ----------
@@ -49,11 +48,11 @@ class Priors:
     gyro_bias, gyro_scale, gyro_misalignment : float
         rad/s, 1, rad, each axis.
     skew : float
-        By how much the accelerometers' sample may end later than the gyros', s; 0: known to be none.
+        Delay of the end of the accelerometers' sample after the gyros', s; 0: known to be none.
     quadratic : float
         Quadratic term of an accelerometer, 1/(m/s^2).
     arm : float
-        What the data tell no better than this counts as not seen, m: a drawing does as well.
+        A direction of the lever arms with a larger sigma is unobservable, m: a drawing is as accurate.
     """
 
     accelerometer_bias: float = 50.0 * UG
@@ -75,17 +74,17 @@ class Run:
     ----------
     label : str
         Capture and number of the rotation in it.
-    rotation : Rotation
-        As found, with the rests beside it.
+    rotation : AcceptedRotation
+        The rotation and the rests before and after it.
     aligned : Aligned
-        The alignment it starts from.
+        Initial alignment.
     gravity : float
         m/s^2.
     rows : ndarray of MEASUREMENT
-        Every 20 ms from the start of navigation; velocity is measured minus true at rest.
+        Every 20 ms from the start of navigation; at rest, velocity is measured minus true.
     v_n : ndarray, shape (n, 3)
-        Mean velocity over the samples from the row before to each row, m/s: pulses of a level accelerometer,
-        20 to 100 a second, beat with single values.
+        Mean velocity over the samples between the row before and each row, m/s: the pulses of a level
+        accelerometer, 20 to 100 per second, would alias into single values.
     t_s : ndarray, shape (n,)
         Time of each row from the start of navigation, by the counter.
     before, after : ndarray of bool, shape (n,)
@@ -93,7 +92,7 @@ class Run:
     """
 
     label: str
-    rotation: Rotation
+    rotation: AcceptedRotation
     aligned: Aligned
     gravity: float
     rows: Records
@@ -105,148 +104,149 @@ class Run:
 
 @dataclass(frozen=True)
 class CaptureRuns:
-    """What a capture gives.
+    """Rests, rotations and runs of a capture.
 
     Attributes
     ----------
     segments : Segments
-        All that was found.
+        All rests and rotations.
     runs : tuple of Run
-        The rotations that serve.
-    rejected : tuple of (Rotation, tuple of str)
+        The accepted rotations, navigated.
+    rejected : tuple of RejectedRotation
         The other motions, with the reasons.
     """
 
     segments: Segments
     runs: tuple[Run, ...]
-    rejected: tuple[tuple[Rotation, tuple[str, ...]], ...]
+    rejected: tuple[RejectedRotation, ...]
+
+
+@dataclass(frozen=True)
+class NavigationOptions:
+    """Selection of rotations, and prior knowledge for their alignment.
+
+    Attributes
+    ----------
+    limits : RotationLimits
+        Limits of an accepted rotation.
+    priors : Priors
+        For the predicted accuracy of the alignment.
+    expected : {'X', 'Y', 'Z'} or None
+        Body axis that has to be vertical; None: any.
+    """
+
+    limits: RotationLimits = field(default_factory=RotationLimits)
+    priors: Priors = field(default_factory=Priors)
+    expected: str | None = None
 
 
 def navigate_rotations(
     read: Callable[[], Iterable[Records]],
     C_ba: ArrayLike,
     site: Site,
-    *,
     label: str = "",
-    limits: RotationLimits | None = None,
-    priors: Priors | None = None,
-    expected: str | None = None,
+    options: NavigationOptions | None = None,
 ) -> CaptureRuns:
-    """Find the rotations of a capture and navigate them.
+    """Find the rotations of a capture and navigate the accepted ones.
 
     Parameters
     ----------
     read : callable
-        Gives the capture's INCREMENTS from the beginning, piece by piece, without size-effect compensation;
+        Returns the capture's INCREMENTS from the beginning, in pieces, without size-effect compensation;
         called twice.
     C_ba : array_like, shape (3, 3)
-        Accelerometer axes to body, of the calibration that made the increments.
+        Accelerometer axes to body, of the calibration of the increments.
     site : Site
-        Where the unit stands.
+        Place of the unit.
     label : str
-        How messages and reports call the capture.
-    limits : Limits, optional
-        What a rotation has to keep.
-    priors : Priors, optional
-        For the predicted accuracy of the alignment.
-    expected : {'X', 'Y', 'Z'}, optional
-        Body axis that the procedure wants vertical.
+        Name of the capture in messages and reports.
+    options : NavigationOptions, optional
+        Limits, priors and expected axis.
 
     Returns
     -------
-    Evidence
+    CaptureRuns
 
     Raises
     ------
     InputError
-        The capture is too short, or a rest cannot be aligned on.
+        The capture is too short, or a rest cannot be used for alignment.
     """
-    limits, priors = limits or RotationLimits(), priors or Priors()
+    options = options or NavigationOptions()
     segments = find_segments(without_dither(read()))
-    verdicts = [(rotation, rejection_reasons(rotation, limits, expected)) for rotation in segments.rotations]
-    good = [rotation for rotation, reasons in verdicts if not reasons]
-    open_runs = [
-        _RunBuilder(f"{label}#{k + 1}", rotation, segments.interval_s, C_ba, site, priors)
-        for k, rotation in enumerate(good)
-    ]
-    if open_runs:
+    builders: list[_RunBuilder] = []
+    rejected: list[RejectedRotation] = []
+    for rotation in segments.rotations:
+        assessed = assess(rotation, options.limits, options.expected)
+        if isinstance(assessed, RejectedRotation):
+            rejected.append(assessed)
+        else:
+            name = f"{label}#{len(builders) + 1}"
+            builders.append(_RunBuilder(name, assessed, segments.interval_s, C_ba, site, options.priors))
+    if builders:
         for piece in without_dither(read()):
-            for run in open_runs:
-                run.feed(piece)
-    return CaptureRuns(
-        segments,
-        tuple(run.result() for run in open_runs),
-        tuple((rotation, reasons) for rotation, reasons in verdicts if reasons),
-    )
+            for builder in builders:
+                builder.feed(piece)
+    return CaptureRuns(segments, tuple(builder.result() for builder in builders), tuple(rejected))
 
 
 class _RunBuilder:
-    """One rotation on its way: takes what concerns it from the pieces that come by."""
+    """Aligns and navigates one rotation from the pieces of its capture."""
 
     def __init__(
         self,
         label: str,
-        rotation: Rotation,
+        rotation: AcceptedRotation,
         interval_s: float,
         C_ba: ArrayLike,
         site: Site,
         priors: Priors,
     ) -> None:
-        assert rotation.before is not None
-        assert rotation.after is not None
         self._label, self._rotation, self._interval_s = label, rotation, interval_s
         self._C_ba, self._site = C_ba, site
         rest_s = rotation.before.duration_s
         navigated_s = min(BEFORE_S, rest_s - MIN_ALIGNMENT_S)
         aligned_s = min(ALIGNMENT_S, rest_s - navigated_s)
         self._begin = rotation.start - round(navigated_s / interval_s)
-        self._next = self._begin - round(aligned_s / interval_s)  # counter of the first sample wanted
+        self._first = self._begin - round(aligned_s / interval_s)  # counter of the first sample needed
         self._stop = min(rotation.after.stop, rotation.stop + round(AFTER_S / interval_s))
         self._alignment = Alignment(site.latitude_rad, priors.gyro_bias, priors.accelerometer_bias, aligned_s)
-        self._aligned: Aligned | None = None
-        self._navigator: Navigator | None = None
+        self._started: tuple[Aligned, Navigator] | None = None
         self._every = max(1, round(BLOCK_NS * NS / interval_s))
         self._navigated = 0
         self._rows: list[Records] = []
         self._v_n: list[Array] = []
 
     def feed(self, increments: Records) -> None:
-        """Take a piece of the capture."""
-        first, begin, stop = np.searchsorted(increments["counter"], [self._next, self._begin, self._stop])
+        """Process a piece of the capture."""
+        first, begin, stop = np.searchsorted(increments["counter"], [self._first, self._begin, self._stop])
         if first < begin:
             self._alignment.feed(increments[first:begin])
         if begin < stop:
-            if self._navigator is None:
-                self._aligned = self._alignment.result()
-                self._navigator = self._navigation(self._aligned)
-            rows = self._navigator.feed(increments[max(first, begin) : stop])
+            if self._started is None:
+                aligned = self._alignment.result()
+                self._started = aligned, Navigator.from_site(self._site, aligned.q_nb, C_ba=self._C_ba)
+            rows = self._started[1].feed(increments[max(first, begin) : stop])
             self._rows.append(rows[-(self._navigated + 1) % self._every :: self._every].copy())
             self._v_n.append(rows["v_n"].copy())
             self._navigated += len(rows)
 
-    def _navigation(self, aligned: Aligned) -> Navigator:
-        site = self._site
-        return Navigator(
-            site.latitude_rad,
-            site.longitude_rad,
-            site.height_m,
-            site.gravity_m_s2,
-            aligned.q_nb,
-            C_ba=self._C_ba,
-        )
-
     def result(self) -> Run:
-        """What has come by."""
-        assert self._aligned is not None
-        rows = np.concatenate(self._rows) if self._rows else np.zeros(0, MEASUREMENT)
+        """Return the navigated rotation."""
+        if self._started is None:
+            raise InputError(
+                f"{self._label}: expected the same samples in both passes, got none of this rotation in the "
+                "second"
+            )
+        rows = np.concatenate(self._rows)
         v_n = np.concatenate(self._v_n)[: len(rows) * self._every]
         counter = rows["counter"]
         guard = round(GUARD_S / self._interval_s)
         return Run(
             self._label,
             self._rotation,
-            self._aligned,
-            self._site.gravity_m_s2 or normal_gravity(self._site.latitude_rad, self._site.height_m),
+            self._started[0],
+            self._site.gravity,
             rows,
             v_n.reshape(len(rows), self._every, 3).mean(axis=1),
             (counter + 1 - self._begin) * self._interval_s,

@@ -1,12 +1,12 @@
-"""Where the origin of b is put, and how other programs count the lever arms.
+"""Gauges of the lever arms: the choice of the origin of b.
 
-Turned between rests, a unit shows how its three sensing points lie to each other, not where the origin lies.
-A gauge names the choice; a change of gauge is one common shift, and exact:
+Rotations between rests determine the positions of the three sensing points relative to each other, not their
+origin. A gauge is a choice of origin; a change of gauge is one common shift, and exact:
 
     r_i' = r_i - (sum of w_j r_j)        w = (1, 1, 1) / 3 in `centroid`, (1, 0, 0) in `x`, ...
 
-`given` puts the origin where one point is stated to be, from a drawing; the statement bears no error here.
-The differences of the points, and what compensated data say at rest, are the same in every gauge.
+`given` defines the origin by the known position of one point, from a drawing, which is taken as exact. The
+differences of the points, and compensated data at rest, are the same in every gauge.
 
 **Kalibr** (`--imu-models scale-misalignment-size-effect`) writes metres, axes of its frame i, x as origin:
 `accelerometers: {rx_i: [0, 0, 0], ry_i: [...], rz_i: [...]}`. Frame i is our b. Its model has the size effect
@@ -24,8 +24,10 @@ from typing import Final, Literal, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
+from calib.html_table import html_table
 from imudrv.arrays import Array
 from imudrv.errors import InputError
+from imudrv.units import MM
 
 Gauge: TypeAlias = Literal["centroid", "x", "y", "z", "given"]
 
@@ -41,62 +43,78 @@ _WEIGHTS: Final = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class LeverArms:
-    """The sensing points in a gauge.
+    """The sensing points of the accelerometers in a gauge.
 
     Attributes
     ----------
     r_b : ndarray, shape (3, 3)
         Row i: sensing point of accelerometer i, m, body axes.
     covariance : ndarray, shape (9, 9), or None
-        Of (r_x, r_y, r_z) in the gauge, m^2; None: not known.
+        Covariance of (r_x, r_y, r_z) in the gauge, m^2; None: unknown.
     gauge : {'centroid', 'x', 'y', 'z', 'given'}
-        Where the origin of b is.
+        Position of the origin of b.
     """
 
     r_b: Array
     covariance: Array | None
     gauge: Gauge
 
+    def __repr__(self) -> str:
+        points = ", ".join(
+            f"r_{axis} ({', '.join(f'{value:+.3f}' for value in r)})"
+            for axis, r in zip("xyz", self.r_b / MM, strict=True)
+        )
+        return f"<LeverArms: gauge {self.gauge}, mm: {points}>"
+
+    def _repr_html_(self) -> str:
+        cells = [f"{value:+.3f}" for value in self.r_b.ravel() / MM]
+        if self.covariance is not None:
+            sigma = np.sqrt(np.diag(self.covariance)) / MM
+            cells = [f"{cell} ± {s:.3f}" for cell, s in zip(cells, sigma, strict=True)]
+        rows = [(f"r_{axis}", *cells[3 * k : 3 * k + 3]) for k, axis in enumerate("xyz")]
+        return html_table(f"Lever arms, gauge {self.gauge}", ("mm", "X", "Y", "Z"), rows)
+
 
 def convert(
-    arms: LeverArms, to: Gauge, stated: tuple[Literal["x", "y", "z"], ArrayLike] | None = None
+    arms: LeverArms, to: Gauge, known_point: tuple[Literal["x", "y", "z"], ArrayLike] | None = None
 ) -> LeverArms:
-    """Go over to another gauge.
+    """Convert lever arms to another gauge.
 
     Parameters
     ----------
-    arms : Arms
+    arms : LeverArms
         In any gauge.
     to : {'centroid', 'x', 'y', 'z', 'given'}
-        The new one.
-    stated : tuple of an accelerometer and its sensing point, optional
-        For `given`: one of 'x', 'y', 'z' and where that one senses, m, body axes, shape (3,).
+        The new gauge.
+    known_point : tuple of an accelerometer and its sensing point, optional
+        For `given`: one of 'x', 'y', 'z' and its sensing point, m, body axes, shape (3,).
 
     Returns
     -------
-    Arms
+    LeverArms
 
     Raises
     ------
     InputError
-        Not a gauge; `given` without a statement, or a statement without `given`; a point that is none.
+        Unknown gauge; `given` without a known point, or a known point with another gauge; invalid point.
     """
     if to not in GAUGES:
         raise InputError(f"gauge: expected one of {', '.join(GAUGES)}, got {to!r}")
     if to != "given":
-        if stated is not None:
+        if known_point is not None:
             raise InputError(
-                f"gauge {to}: expected no stated point, got one of accelerometer {stated[0]}; use gauge given"
+                f"gauge {to}: expected no known point, got one of accelerometer {known_point[0]}; "
+                "use gauge given"
             )
         return _shifted(arms, to, _WEIGHTS[to], np.zeros(3))
-    if stated is None:
+    if known_point is None:
         raise InputError(
-            "gauge given: expected where one sensing point is, from a drawing, got none; the rotations alone "
-            "cannot tell it"
+            "gauge given: expected the position of one sensing point, from a drawing, got none; rotations "
+            "alone do not determine it"
         )
-    accelerometer, place = stated
+    accelerometer, place = known_point
     point = np.asarray(place, np.float64)
     if accelerometer not in ("x", "y", "z") or point.shape != (3,) or not np.isfinite(point).all():
         raise InputError(

@@ -18,15 +18,15 @@ from imudrv.arrays import Array
 from imudrv.errors import InputError
 
 _DIGITS: Final = 12
-"""Decimals of a metre that other programs' files get."""
+"""Decimals of a metre in the files of other programs."""
 
 
 def to_kalibr(arms: LeverArms) -> dict[str, Any]:
-    """The arms as Kalibr's IMU file has them.
+    """Return the lever arms in the format of Kalibr's IMU file.
 
     Parameters
     ----------
-    arms : Arms
+    arms : LeverArms
         In any gauge.
 
     Returns
@@ -39,22 +39,22 @@ def to_kalibr(arms: LeverArms) -> dict[str, Any]:
 
 
 def from_kalibr(document: Mapping[str, Any]) -> LeverArms:
-    """Read the arms of Kalibr's IMU file.
+    """Return the lever arms of Kalibr's IMU file.
 
     Parameters
     ----------
     document : mapping
-        Of one IMU: what stands below `imu0`.
+        Section of one IMU: the content of `imu0`.
 
     Returns
     -------
-    Arms
+    LeverArms
         In gauge x, without covariance.
 
     Raises
     ------
     InputError
-        There are no such arms in it.
+        It contains no such lever arms.
     """
     section = document.get("accelerometers")
     r_b = _points("Kalibr: accelerometers", section, [f"r{axis}_i" for axis in "xyz"])
@@ -62,11 +62,11 @@ def from_kalibr(document: Mapping[str, Any]) -> LeverArms:
 
 
 def to_psins(arms: LeverArms) -> dict[str, list[float]]:
-    """The arms as a PSINS calibration struct has them, for `imuclbt` to compensate with.
+    """Return the lever arms in the format of a PSINS calibration struct, for compensation by `imuclbt`.
 
     Parameters
     ----------
-    arms : Arms
+    arms : LeverArms
         In any gauge, which is kept.
 
     Returns
@@ -78,7 +78,7 @@ def to_psins(arms: LeverArms) -> dict[str, list[float]]:
 
 
 def from_psins(clbt: Mapping[str, Any]) -> LeverArms:
-    """Read the arms of a PSINS calibration struct, as `sysclbt` finds it.
+    """Return the lever arms of a PSINS calibration struct, as `sysclbt` computes it.
 
     Parameters
     ----------
@@ -87,13 +87,13 @@ def from_psins(clbt: Mapping[str, Any]) -> LeverArms:
 
     Returns
     -------
-    Arms
+    LeverArms
         In gauge given, for the struct does not name its origin; without covariance.
 
     Raises
     ------
     InputError
-        There are no such arms in it.
+        It contains no such lever arms.
     """
     return LeverArms(_points("PSINS: clbt", clbt, ["rx", "ry", "rz"]), None, "given")
 

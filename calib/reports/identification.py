@@ -183,7 +183,7 @@ def verdict(findings: IdentificationResult) -> Iterator[tuple[str, str]]:
             "way, checks them.",
         )
     for n in result.parameters:
-        if n.name == "skew_s" and not n.seen:
+        if n.name == "skew_s" and not n.observable:
             yield (
                 "note",
                 "These rotations do not determine a gyro-accelerometer skew; the uncertainties allow for one "
@@ -249,7 +249,7 @@ def _measured(findings: IdentificationResult) -> Iterator[Block]:
             (
                 ("capture", sanitise(", ".join(parts))),
                 ("SHA-256", source.sha256),
-                ("contents", f"{source.evidence.segments.duration_s:.1f} s; {source.books}"),
+                ("contents", f"{source.evidence.segments.duration_s:.1f} s; {source.counts}"),
                 ("temperature", f"{warm} degC" if warm else "not told by the unit"),
             )
         )

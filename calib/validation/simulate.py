@@ -16,7 +16,7 @@ from calib.certificate import PROVENANCE_IDENTIFIED, with_lever_arms
 from calib.detection.acceptance import RotationLimits
 from calib.estimation.joint import estimate_joint
 from calib.estimation.result import LeverArmEstimate
-from calib.estimation.runs import Run, navigate_rotations
+from calib.estimation.runs import NavigationOptions, Run, navigate_rotations
 from calib.lever_arms.gauge import LeverArms
 from calib.validation.navigate import navigate
 from calib.validation.trial import RATE_FILTER, Trial, TrialSettings
@@ -301,7 +301,7 @@ def _evidence(name: str, unit: Unit, seed: list[int], known: Calibration) -> tup
             yield compensator.feed(pulses)
 
     captured = list(_pulses(run, layout.interval_ns))
-    return navigate_rotations(increments, bare.C_ba, run.site, label=name, limits=limits).runs
+    return navigate_rotations(increments, bare.C_ba, run.site, name, NavigationOptions(limits)).runs
 
 
 def _rows(matrix: Array) -> Any:

@@ -13,15 +13,12 @@ import numpy as np
 import pytest
 import yaml
 
+import calib
 from calib.cli.main import main
-from calib.identification import PriorCalibration, identify_captures
-from imudrv.calibration import read_calibration_file, write_calibration
+from imudrv.calibration import write_calibration
 from imudrv.cli import main as imudrv
 from imudrv.errors import InputError
-from imudrv.files import settings_file
-from imudrv.profiles import load as load_profile
 from imudrv.sim.scenario import NOMINAL
-from imudrv.site import Site
 
 SITE = "{latitude_deg: 28.2, longitude_deg: 113.0, height_m: 60.0}"
 SCENARIO = """
@@ -147,7 +144,10 @@ def test_recordings_bring_their_own_profile_and_calibration(
     assert main([*recordings, "--unit", "50-0018"]) == 2
     assert "z.mcap: expected a recording of unit '50-0018', got one of '50-0017'" in capsys.readouterr().err
     assert main(["identify", "z.mcap", "x.raw", "--site", "site.yaml", "-o", "never.yaml"]) == 2
-    assert "x.raw: expected --calibration, for there is none in it" in capsys.readouterr().err
+    assert (
+        "x.raw: expected a calibration, got a capture without one; use --calibration"
+        in capsys.readouterr().err
+    )
 
 
 def test_a_chosen_channel_of_a_log_of_two_units_is_named_in_certificate_and_report(
@@ -199,11 +199,9 @@ def test_a_capture_that_grows_while_it_is_read_gives_nothing(here: Path) -> None
             with growing.open("ab") as capture:
                 capture.write(b"more")
 
-    unit = read_calibration_file(here / "unit.yaml")
-    basis = PriorCalibration(unit.model, "unit.yaml", unit.sha256)
-    site = settings_file.read(here / "site.yaml", Site)
+    files = {"calibration": here / "unit.yaml", "site": here / "site.yaml"}
     with pytest.raises(InputError, match=r"growing.raw: .* it was changed while it was read"):
-        identify_captures([growing], load_profile("imu50-rs422"), basis, site, advance=grow)
+        calib.identify([growing], **files, profile="imu50-rs422", advance=grow)
 
 
 # Long, so that reading it takes a while.
@@ -261,7 +259,7 @@ def test_the_plain_method_and_a_gauge_by_name(here: Path, capsys: pytest.Capture
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ([*CAPTURES, "--gauge", "given"], "nine components of the lever arms were asked for"),
+        ([*CAPTURES, "--gauge", "given"], "expected a fixed pivot for nine components of the lever arms"),
         ([*CAPTURES, "--at", "y=1,2,3"], "--at: expected with --gauge given"),
         (
             [*CAPTURES, "--gauge", "given", "--at", "w=1,2,3"],
@@ -317,7 +315,7 @@ def test_a_gauge_is_converted_from_file_to_file_and_back(
     assert back["size_effect"] == {"r_mm": TRUTH_MM, "gauge": "centroid"}
     assert back["provenance"]["inner_lever_arms_gauge"]["from"] == "given"
     assert main(["gauge", "unit.yaml", "--to", "given", "-o", "nine.yaml"]) == 2
-    assert "expected where one sensing point is" in capsys.readouterr().err
+    assert "expected the position of one sensing point" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("program", ["kalibr", "psins"])

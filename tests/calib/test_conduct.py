@@ -370,7 +370,7 @@ def test_evidence_is_whole_though_the_worker_is_held_up_for_as_long_as_a_step_ta
     service.run()
     tap.close()
     worker.join()
-    assert "expected rotations that see 6 directions" in str(conduct.error)
+    assert "expected rotations that determine 6 directions" in str(conduct.error)
     assert list(session.accepted) == ["z-up"]
     assert verify(session.folder).faults == ()
 

@@ -332,7 +332,7 @@ def test_a_skipped_step_is_left_out_and_what_is_then_not_seen_is_said(drive: Dri
     assert isinstance(skipped, Skipped)
     assert entered.phase is Phase.DONE
     assert (finished.accepted, finished.skipped) == (("z",), ("x",))
-    assert "expected rotations that see 6 directions" in finished.reasons[0]
+    assert "expected rotations that determine 6 directions" in finished.reasons[0]
     assert driver.engine.view.reasons == finished.reasons
     assert driver.act(Skip("x")) == ()
     assert [type(e) for e in driver.act(Redo("x"))] == [Redone, Entered]
@@ -462,7 +462,7 @@ def test_a_sample_that_is_missing_in_the_turn_rejects_it(drive: Drive, turned: R
     driver = drive().feed(np.delete(turned, [during]))
 
     (rejected,) = driver.of(Rejected)
-    assert rejected.reasons == ("1 samples missing during the rotation, want 0 at most",)
+    assert rejected.reasons == ("1 samples missing during the rotation, want at most 0",)
     assert driver.phases[-2:] == ["verdict", "place"]
 
 

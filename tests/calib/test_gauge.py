@@ -84,8 +84,8 @@ def test_the_map_of_the_covariance_is_that_of_the_points() -> None:
 @pytest.mark.parametrize(
     ("to", "stated", "message"),
     [
-        ("given", None, "expected where one sensing point is, from a drawing, got none"),
-        ("x", ("y", POINT), "gauge x: expected no stated point, got one of accelerometer y"),
+        ("given", None, "expected the position of one sensing point, from a drawing, got none"),
+        ("x", ("y", POINT), "gauge x: expected no known point, got one of accelerometer y"),
         ("given", ("w", POINT), "expected x, y or z and three finite numbers, got 'w'"),
         ("given", ("x", (0.0, np.nan, 0.0)), "three finite numbers"),
         ("given", ("x", (0.0, 0.0)), "three finite numbers"),

@@ -1,9 +1,6 @@
-import importlib.util
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -18,7 +15,8 @@ from calib.estimation.joint import estimate_joint
 from calib.estimation.plain import estimate_plain
 from calib.estimation.predict import PlannedRotation, predict
 from calib.estimation.result import CENTROID_BASIS, TO_DIFFERENCES, LeverArmEstimate
-from calib.estimation.runs import Priors, Run, navigate_rotations
+from calib.estimation.runs import NavigationOptions, Priors, Run, navigate_rotations
+from calib.validation import montecarlo
 from imudrv import profiles
 from imudrv.calibration import coefficients, read_calibration
 from imudrv.capture import Capture
@@ -42,20 +40,7 @@ LATITUDE = 28.2 * DEG
 
 
 @pytest.fixture(scope="module")
-def montecarlo() -> ModuleType:
-    """The script of that name."""
-    path = Path(__file__).parents[2] / "tools" / "montecarlo.py"
-    spec = importlib.util.spec_from_file_location("montecarlo", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["montecarlo"] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
-
-
-@pytest.fixture(scope="module")
-def simulated(montecarlo: ModuleType) -> tuple[list[Run], Array]:
+def simulated() -> tuple[list[Run], Array]:
     """Six rotations of a unit, and its true arms."""
     runs, truth = montecarlo.case(5, (1, -1), montecarlo.BUDGETS["standard"])
     return runs, truth
@@ -77,7 +62,7 @@ def captured(reference: Path) -> tuple[list[Run], Array]:
             compensator = Compensator(known, capture.layout, rate_filter("causal", interval_ns))
             return capture.increments(compensator, lambda _: None)
 
-        runs += navigate_rotations(read, known.C_ba, site, label=name).runs
+        runs += navigate_rotations(read, known.C_ba, site, name).runs
     r_mm = yaml.safe_load((reference / "truth.yaml").read_text())["r_mm"]
     return runs, np.array([r_mm[axis] for axis in "xyz"]) * MM
 
@@ -101,7 +86,7 @@ def test_joint_finds_the_arms_of_the_reference_captures(captured: tuple[list[Run
     assert rms_mm(found, truth) < 0.05  # the requirement; the predicted sigma is 0.012
     assert found.rank == 6
     # one direction is that in which a skew of the size of its prior acts, the unit 0.1 m off the axis
-    assert found.reason.startswith("rank 6: the directions seen have a sigma of 0.1")
+    assert found.reason.startswith("rank 6: the observable directions have a sigma of at most 0.1")
     assert found.direction_sigma[4] < 0.03 * MM
     assert found.direction_sigma[6] > 1.0
     error = found.differences.ravel() - TO_DIFFERENCES @ truth.ravel()
@@ -153,7 +138,7 @@ def test_a_common_shift_is_the_only_thing_that_six_rotations_do_not_see(
 
 
 def test_nine_components_without_a_known_pivot_are_refused(simulated: tuple[list[Run], Array]) -> None:
-    assert "a common shift of the three sensing points leaves no velocity at rest" in refused(
+    assert "a common shift of the three sensing points causes no velocity at rest" in refused(
         simulated[0], nine=True
     )
 
@@ -163,13 +148,13 @@ def test_rotations_about_too_few_axes_are_refused_with_the_directions_unseen(
 ) -> None:
     runs = simulated[0]
     message = refused(runs[:2])
-    assert "expected rotations that see 6 directions of the lever arms, got 4" in message
+    assert "expected rotations that determine 6 directions of the lever arms, got 4" in message
     assert "add rotations with another axis up" in message
     # one axis, both signs: what its lean of 3 mrad shows of a third direction is too little
     assert "got 2" in refused([runs[0], runs[3]])
     with pytest.raises(InputError, match="got 4"):
         estimate_plain(runs[:2])
-    assert "expected one good rotation at least, got none" in refused([])
+    assert "expected at least one accepted rotation, got none" in refused([])
 
 
 def test_without_one_of_three_rotations_there_is_no_result_without_one_of_six_nearly_the_same(
@@ -212,11 +197,11 @@ def test_correlations_are_correlations(simulated: tuple[list[Run], Array]) -> No
     ("signs", "skew_s", "limit_mm"), [((1,), 0.0, 0.03), ((1,), 0.5e-3, 0.05), ((1, -1), 0.5e-3, 0.015)]
 )
 def test_many_units_are_found_as_well_as_predicted(
-    montecarlo: ModuleType, signs: tuple[int, ...], skew_s: float, limit_mm: float
+    signs: tuple[int, ...], skew_s: float, limit_mm: float
 ) -> None:
     cases = 12 if len(signs) == 1 else 8
     budget = replace(montecarlo.BUDGETS["standard"], priors=Priors(skew=skew_s))
-    of_joint, of_plain = montecarlo.montecarlo(range(100, 100 + cases), signs, budget)
+    of_joint, of_plain = montecarlo.run_cases(range(100, 100 + cases), signs, budget)
     assert of_joint.mean_rms_mm < limit_mm  # the requirement
     assert of_plain.mean_rms_mm > 5.0 * of_joint.mean_rms_mm
     for found in (of_joint, of_plain):
@@ -232,9 +217,9 @@ def test_many_units_are_found_as_well_as_predicted(
 
 
 @pytest.mark.parametrize("budget", ["bias", "misalignment", "slow", "tilted", "offset", "arw"])
-def test_a_harder_budget_widens_the_prediction_with_the_error(montecarlo: ModuleType, budget: str) -> None:
+def test_a_harder_budget_widens_the_prediction_with_the_error(budget: str) -> None:
     cases = 4
-    found, _ = montecarlo.montecarlo(range(200, 200 + cases), (1,), montecarlo.BUDGETS[budget])
+    found, _ = montecarlo.run_cases(range(200, 200 + cases), (1,), montecarlo.BUDGETS[budget])
     low, high = chi2.ppf([0.0005, 0.9995], 6 * cases) / cases
     assert low < found.nees < high
     least_mm = {"slow": 0.025, "arw": 0.017}.get(budget, 0.012)  # standard: 0.016
@@ -243,7 +228,7 @@ def test_a_harder_budget_widens_the_prediction_with_the_error(montecarlo: Module
 
 @pytest.mark.parametrize(("signs", "sigmas"), [((1,), 4.0), ((1, -1), 3.0)])
 def test_a_skew_of_one_sample_is_within_the_uncertainty(
-    montecarlo: ModuleType, monkeypatch: pytest.MonkeyPatch, signs: tuple[int, ...], sigmas: float
+    monkeypatch: pytest.MonkeyPatch, signs: tuple[int, ...], sigmas: float
 ) -> None:
     scenario = montecarlo.scenario
 
@@ -264,7 +249,7 @@ def test_a_skew_of_one_sample_is_within_the_uncertainty(
     assert worst[0.0] > sigmas  # as it was without the parameter
 
 
-def shaken(montecarlo: ModuleType, amplitude_arcsec: float, frequency_hz: float) -> tuple[list[Run], Array]:
+def shaken(amplitude_arcsec: float, frequency_hz: float) -> tuple[list[Run], Array]:
     """Three rotations of a unit that leaves its dither in the increments."""
     a, f = amplitude_arcsec, frequency_hz
     dither = Dither(amplitude_arcsec=(a, a, a), frequency_hz=(f - 9.0, f, f + 11.0), in_increments=1.0)
@@ -281,10 +266,8 @@ def shaken(montecarlo: ModuleType, amplitude_arcsec: float, frequency_hz: float)
 
 
 @pytest.mark.parametrize("amplitude_arcsec", [3.0, 100.0])
-def test_dither_of_the_blocks_left_in_the_increments_does_no_harm(
-    montecarlo: ModuleType, amplitude_arcsec: float
-) -> None:
-    runs, truth = shaken(montecarlo, amplitude_arcsec, 400.0)
+def test_dither_of_the_blocks_left_in_the_increments_does_no_harm(amplitude_arcsec: float) -> None:
+    runs, truth = shaken(amplitude_arcsec, 400.0)
     found = estimate_joint(runs)
     assert found.refusals == ()
     error = found.differences.ravel() - TO_DIFFERENCES @ truth.ravel()
@@ -292,12 +275,10 @@ def test_dither_of_the_blocks_left_in_the_increments_does_no_harm(
     assert np.abs(error / found.differences_sigma.ravel()).max() < 3.0
 
 
-def test_a_shaking_that_the_filter_passes_is_refused(
-    montecarlo: ModuleType, simulated: tuple[list[Run], Array]
-) -> None:
+def test_a_shaking_that_the_filter_passes_is_refused(simulated: tuple[list[Run], Array]) -> None:
     assert estimate_joint(simulated[0]).refusals == ()
     assert max(run.H_rest for run in estimate_joint(simulated[0]).runs) < 5e-4  # a quarter of the limit
-    runs, _ = shaken(montecarlo, 3.0, 150.0)
+    runs, _ = shaken(3.0, 150.0)
     for found in (estimate_joint(runs), estimate_plain(runs)):
         assert len(found.refusals) == 1
         assert found.refusals[0].startswith("the gyro increments carry dither or vibration")
@@ -332,14 +313,14 @@ def test_slower_rotations_and_fewer_predict_more() -> None:
 @pytest.mark.parametrize(
     ("plan", "message"),
     [
-        ([], "expected one rotation at least, got none"),
+        ([], "expected at least one rotation, got none"),
         (
             THREE[:2],
-            "expected rotations that see 6 directions of the lever arms, got 4; not seen to 3 mm: .*_",
+            "rotations that determine 6 directions of the lever arms, got 4; unobservable to 3 mm: .*_",
         ),
-        ((THREE[0],) * 3, "got 2; not seen"),
+        ((THREE[0],) * 3, "got 2; unobservable"),
         ((replace(THREE[0], up="up"),), r"expected an axis up from \+X to -Z"),
-        ((replace(THREE[0], after_s=0.1),), "a rest of 0.5 s at least"),
+        ((replace(THREE[0], after_s=0.1),), "a rest of at least 0.5 s"),
     ],
 )
 def test_a_plan_that_cannot_do_is_refused(plan: Sequence[PlannedRotation], message: str) -> None:
@@ -354,14 +335,14 @@ def test_the_direction_that_a_plan_does_not_see_is_named() -> None:
     told = str(caught.value)
     assert "x_Z" in told
     assert "z_X" in told
-    assert "Y" not in told.split("not seen")[1].split("add")[0]  # what lies along Y is seen
+    assert "Y" not in told.split("unobservable")[1].split("add")[0]  # what lies along Y is observable
 
 
 # --- a known pivot, and more unknowns ---
 
 
 @pytest.fixture(scope="module")
-def turntable(montecarlo: ModuleType) -> Callable[..., tuple[list[Run], Array]]:
+def turntable() -> Callable[..., tuple[list[Run], Array]]:
     """Three rotations whose fixed point lies so far from the origin of b, and the true arms."""
 
     def make(pivot_mm: float, seed: int = 3) -> tuple[list[Run], Array]:
@@ -401,7 +382,7 @@ def test_what_the_data_cannot_tell_is_said(simulated: tuple[list[Run], Array]) -
     assert estimate_joint(simulated[0]).notes == ()
 
 
-def test_a_skew_is_seen_with_a_known_pivot(montecarlo: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_skew_is_seen_with_a_known_pivot(monkeypatch: pytest.MonkeyPatch) -> None:
     scenario = montecarlo.scenario
 
     def skewed(*arguments: Any) -> Any:
@@ -412,7 +393,7 @@ def test_a_skew_is_seen_with_a_known_pivot(montecarlo: ModuleType, monkeypatch: 
     runs, truth = montecarlo.case(3, (1,), replace(montecarlo.BUDGETS["standard"], pivot_mm=0.0))
     found = estimate_joint(runs, Priors(skew=5e-3), pivot="fixed")
     skew = next(n for n in found.parameters if n.name == "skew_s")
-    assert skew.seen
+    assert skew.observable
     assert skew.value == pytest.approx(3e-3, abs=4.0 * skew.sigma)
     assert skew.sigma < 0.6e-3
     error = (found.R_b - truth).ravel()
@@ -446,7 +427,8 @@ def test_a_turntable_run_gives_all_nine_with_every_other_error(positions: Record
     # quarter turns about level axes, 10 deg/s
     limits = RotationLimits(angle_tolerance_deg=np.inf, least_peak_deg_per_s=0.0, axis_tilt_deg=90.0)
     site = Site(latitude_deg=34.0, longitude_deg=0.0, height_m=0.0)
-    runs = navigate_rotations(lambda: [positions], np.eye(3), site, limits=limits, priors=priors).runs
+    options = NavigationOptions(limits, priors)
+    runs = navigate_rotations(lambda: [positions], np.eye(3), site, options=options).runs
     assert len(runs) == 18
     found = estimate_joint(runs, priors, pivot="fixed", nine=True, extra=("quadratic",))
     truth = -np.array([[10.0, 20.0, 30.0], [40.0, 50.0, 60.0], [0.0, 0.0, 0.0]]) * MM

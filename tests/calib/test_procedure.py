@@ -55,7 +55,7 @@ def test_a_plan_that_does_not_see_the_six_differences_is_refused_with_the_direct
     plan = procedure({"id": "z", "up": "+Z", "east": "+X", "turn_deg": 180, "repeats": 4})
 
     with pytest.raises(
-        InputError, match=r"procedure test: .*see 6 directions .*got 2; not seen.*x_Z.*axis up"
+        InputError, match=r"procedure test: .*determine 6 directions .*got 2; unobservable.*x_Z.*axis up"
     ):
         predicted(plan, site)
 
@@ -63,7 +63,7 @@ def test_a_plan_that_does_not_see_the_six_differences_is_refused_with_the_direct
 def test_what_is_skipped_is_not_predicted(site: Site) -> None:
     plan = load("three-rotations")
 
-    with pytest.raises(InputError, match=r"see 6 directions .*got 4"):
+    with pytest.raises(InputError, match=r"determine 6 directions .*got 4"):
         predicted(plan, site, skipped=["x-up"])
 
 

@@ -11,7 +11,7 @@ import pytest
 from calib.bench.technician import Mistake, technician_scenario
 from calib.estimation.joint import estimate_joint
 from calib.estimation.result import TO_DIFFERENCES, LeverArmEstimate
-from calib.estimation.runs import navigate_rotations
+from calib.estimation.runs import NavigationOptions, navigate_rotations
 from calib.procedure.engine import Accepted, Engine, Event, Finished, Phase, Rejected, Restarted
 from calib.procedure.plan import load, predicted
 from calib.procedure.schema import Procedure
@@ -60,9 +60,8 @@ class Performance:
                 lambda inside=inside: [self.samples[inside]],
                 calibration.accelerometer.C_ba_array,
                 self.scenario.site,
-                label=step.id,
-                limits=self.procedure.rotation_limits(step),
-                expected=step.up[1],
+                step.id,
+                NavigationOptions(self.procedure.rotation_limits(step), expected=step.up[1]),
             )
             assert len(evidence.runs) == 1
             assert not evidence.rejected

@@ -11,10 +11,9 @@ import pytest
 from rich.cells import cell_len
 
 from calib.estimation.result import LeaveOneOut
-from calib.identification import IdentificationResult, PriorCalibration, identify_captures
+from calib.identification import IdentificationResult, PriorCalibration, identify
 from calib.lever_arms.gauge import LeverArms, convert
 from calib.reports.identification import arms_text, report_html, report_text, verdict
-from imudrv import profiles
 from imudrv.cli import main as imudrv
 from imudrv.sim.scenario import NOMINAL
 from imudrv.site import Site
@@ -50,9 +49,8 @@ def findings(tmp_path_factory: pytest.TempPathFactory) -> IdentificationResult:
         assert imudrv(["sim", str(folder / "run.yaml"), "--profile", "imu50-rs422", *out]) == 0
     unit = NOMINAL.model_copy(update={"serial_number": "50<b>&17"})
     site = Site(latitude_deg=28.2, longitude_deg=113.0, height_m=60.0)
-    return identify_captures(
-        captures, profiles.load("imu50-rs422"), PriorCalibration(unit, "<u>.yaml", "0f" * 32), site
-    )
+    prior = PriorCalibration(unit, "<u>.yaml", "0f" * 32)
+    return identify(captures, site=site, calibration=prior, profile="imu50-rs422")
 
 
 @pytest.fixture(scope="module")

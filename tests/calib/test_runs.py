@@ -4,7 +4,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.estimation.runs import AFTER_S, BEFORE_S, CaptureRuns, navigate_rotations
+from calib.estimation.runs import AFTER_S, BEFORE_S, CaptureRuns, NavigationOptions, navigate_rotations
 from imudrv.errors import InputError
 from imudrv.records import Records
 from imudrv.site import Site
@@ -15,7 +15,7 @@ Step = Callable[..., Any]
 
 def evidence(data: Records, site: Site, pieces: int = 5, **options: Any) -> CaptureRuns:
     return navigate_rotations(
-        lambda: np.array_split(data, pieces), np.eye(3), site, label="capture", **options
+        lambda: np.array_split(data, pieces), np.eye(3), site, "capture", NavigationOptions(**options)
     )
 
 
@@ -110,5 +110,5 @@ def test_gravity_is_the_sites_own(bench: Bench, step: Step, site: Site) -> None:
 
 
 def test_a_capture_too_short_is_refused(bench: Bench, step: Step, site: Site) -> None:
-    with pytest.raises(InputError, match="expected a capture of 2 s at least"):
+    with pytest.raises(InputError, match="expected a capture of at least 2 s"):
         evidence(bench(step(1.0)), site)

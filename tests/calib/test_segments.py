@@ -61,7 +61,7 @@ def test_any_cut_into_pieces_finds_the_same(bench: Bench, step: Step, pieces: in
         ([(40.0,), (7.0, 180.0), (8.0,)], "peak 48 deg/s: slower than 70, expect 3.2 mm"),
         (
             [(40.0,), (2.5, 180.0, (0.3, 0.0, 1.0)), (8.0,)],
-            "axis 16.7 deg off the vertical, want 10 at most",
+            "axis 16.7 deg off the vertical, want at most 10",
         ),
         ([(20.0,), (2.5, 180.0), (8.0,)], "rest before 20.0 s, want 32"),
         ([(40.0,), (2.5, 180.0), (3.0,)], "rest after 3.0 s, want 5"),
@@ -89,9 +89,9 @@ def test_missing_samples_and_flags_in_the_rotation_are_told(bench: Bench, step: 
     kept["flags"][turning + 5] |= Flag.SATURATED
     kept["flags"][turning + 6] |= Flag.FAULT
     assert rejection_reasons(only(find_segments([kept])), LIMITS) == (
-        "3 samples missing during the rotation, want 0 at most",
+        "3 samples missing during the rotation, want at most 0",
         "an axis saturated during the rotation",
-        "the unit told a fault during the rotation",
+        "the unit reported a fault during the rotation",
     )
 
 
@@ -206,7 +206,7 @@ def test_the_slower_the_rotation_the_larger_the_expected_error() -> None:
 
 
 def test_too_little_data_are_refused(bench: Bench, step: Step) -> None:
-    with pytest.raises(InputError, match=r"expected a capture of 2 s at least, got 1\.0 s"):
+    with pytest.raises(InputError, match=r"expected a capture of at least 2 s, got 1\.0 s"):
         find_segments([bench(step(1.0))])
     with pytest.raises(InputError, match=r"got 0\.0 s"):
         find_segments([])

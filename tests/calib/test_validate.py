@@ -176,7 +176,7 @@ def test_a_skew_is_estimated_with_a_rocking_and_put_right() -> None:
     made = made.model_copy(update={"unit": unit})
     who = subject(unit, 2, procedure=(*simulation.PROCEDURE, "rocking"))
     (skew,) = (n for n in who.result.parameters if n.name == "skew_s")
-    assert skew.seen
+    assert skew.observable
     assert skew.value == pytest.approx(1e-3, abs=3.0 * skew.sigma)
     ignored, right = (
         evaluate(trial("rocking", made, who, 2, align_s=ALIGN_S, skew_s=s)) for s in (0.0, who.skew_s)
