@@ -156,7 +156,7 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
         writer.start()
         writer.finish()
     with pytest.raises(
-        InputError, match=r"expected a recording with its profile\.yaml, got none: it is not one"
+        InputError, match=r"expected a recording with its profile\.yaml, got none: it is not from this driver"
     ):
         _ = Recording(path).profile
 
