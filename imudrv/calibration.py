@@ -1,6 +1,6 @@
-"""The calibration of one unit: its certificate, as file and in SI.
+"""Calibration certificate of one unit, as a file and in SI.
 
-Fields have the names and units of the file; the arrays that the mathematics uses are properties beside them.
+Fields have the names and units of the file; properties give them as arrays in SI.
 """
 
 import json
@@ -164,14 +164,14 @@ class SensingPoints(Model):
 
 
 class SizeEffect(Model):
-    """Sensing points of the accelerometers, in a stated gauge."""
+    """Sensing points of the accelerometers, and the gauge that they are in."""
 
     r_mm: SensingPoints
     gauge: Literal["centroid", "x", "y", "z", "given"]
     covariance_mm2: Annotated[Matrix9, AfterValidator(_covariance)] | None = None
 
     @model_validator(mode="after")
-    def _origin_is_where_the_gauge_says(self) -> Self:
+    def _origin_fits_the_gauge(self) -> Self:
         origin = {
             "centroid": self.r_m.sum(axis=0) / MM,
             "x": self.r_mm.x,
@@ -199,7 +199,7 @@ class SizeEffect(Model):
 
 
 class Temperature(Model):
-    """Change of biases and scale factors per kelvin from the reference, and the range of validity."""
+    """Change of biases and scale factors per kelvin from the reference temperature, and range of validity."""
 
     reference_degc: Celsius
     range_degc: Annotated[tuple[Celsius, Celsius], AfterValidator(_range)]
@@ -232,8 +232,8 @@ class Temperature(Model):
 class Calibration(Model):
     """The certificate of one unit.
 
-    Without `size_effect` this is not compensated; without `temperature` nothing depends on it. `provenance`
-    describes how the calibration was made; it is preserved unchanged.
+    Without `size_effect` the size effect is not compensated; without `temperature` nothing depends on the
+    temperature. `provenance` describes how the calibration was made; it is preserved unchanged.
     """
 
     format: Literal["imu50-calibration"]
@@ -247,7 +247,7 @@ class Calibration(Model):
     provenance: Annotated[dict[str, JsonValue], AfterValidator(_provenance)] | None = None
 
     def without_size_effect(self) -> Self:
-        """Return the same calibration with which the size effect is not compensated."""
+        """Return the same calibration without the sensing points."""
         return self.model_copy(update={"size_effect": None})
 
 
@@ -259,7 +259,7 @@ def read_calibration(path: str | os.PathLike[str], unit: str | None = None) -> C
     path : path-like
         The file.
     unit : str, optional
-        Serial number of the unit that is connected; not given: any.
+        Serial number that is required; any if absent.
 
     Returns
     -------
@@ -281,7 +281,7 @@ def read_calibration_file(path: str | os.PathLike[str], unit: str | None = None)
     path : path-like
         The file.
     unit : str, optional
-        Serial number of the unit that is connected; not given: any.
+        Serial number that is required; any if absent.
 
     Returns
     -------
@@ -300,7 +300,7 @@ def require_unit(calibration: Calibration, unit: str | None, name: str) -> None:
     calibration : Calibration
         The certificate.
     unit : str or None
-        Serial number of the unit that is connected; None: any.
+        Serial number that is required; None: any.
     name : str
         Name of the certificate in the message.
 
@@ -317,14 +317,14 @@ def require_unit(calibration: Calibration, unit: str | None, name: str) -> None:
 
 
 def write_calibration(path: str | os.PathLike[str], calibration: Calibration) -> None:
-    """Write a calibration; an existing file is kept under a name with its date.
+    """Write a calibration; an existing file is kept under a name with its time.
 
     Parameters
     ----------
     path : path-like
         The file.
     calibration : Calibration
-        Comes back from `read_calibration` bit for bit.
+        The certificate; `read_calibration` returns the same bits.
 
     Raises
     ------

@@ -1,22 +1,22 @@
-"""The error tree: short, and each branch says whose fault it is.
+"""Errors of this product.
 
-A message says what was expected, what came, where, and what to do. The command line turns
-:class:`InputError` into exit code 2; anything else that escapes is a defect of this product.
+A message says what was expected, what was found, where, and what to do. The command line turns `InputError`
+into exit code 2; any other exception that escapes is a defect of this product.
 """
 
 from collections.abc import Sequence
 
 
 class Imu50Error(Exception):
-    """Anything that this product raises on purpose."""
+    """Base of all errors that this product raises on purpose."""
 
 
 class InputError(Imu50Error):
-    """What the user gave cannot be used: a file, an option, a value."""
+    """A file, an option or a value that the user gave cannot be used."""
 
 
 class FaultyFileError(InputError):
-    """A settings file with faults, all of them told at once.
+    """A settings file with faults; all of them are reported at once.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What flows: numpy record arrays with time along the first axis, one row live, millions offline.
+"""Record arrays of samples, time along the first axis: one row live, millions offline.
 
     bytes -> FRAME -> PULSES -> INCREMENTS
 
@@ -13,14 +13,10 @@ from numpy.typing import NDArray
 
 Records: TypeAlias = NDArray[np.void]
 
-
 MAX_TEMPERATURES: Final = 6
-"""Temperature channels that a profile may have."""
-
-
+"""Largest number of temperature channels of a profile."""
 NO_TEMPERATURE: Final = -(2**31)
-"""Temperature counts of a channel from which nothing has been received yet."""
-
+"""Temperature counts of a channel from which nothing has been received."""
 
 MESSAGE: Final = np.dtype(
     [
@@ -28,12 +24,11 @@ MESSAGE: Final = np.dtype(
         ("id", np.uint32),
         ("length", np.uint8),  # of the data, bytes
         ("fd", np.uint8),  # 1: CAN FD
-        ("data", np.uint8, 64),  # zeros behind the length
+        ("data", np.uint8, 64),  # zeros after the length
     ],
     align=True,
 )
 """One CAN message."""
-
 
 FRAME: Final = np.dtype(
     [
@@ -49,18 +44,14 @@ FRAME: Final = np.dtype(
     ],
     align=True,
 )
-"""One good frame as received."""
-
+"""One valid frame as received."""
 
 PULSES: Final = np.dtype(
     [
         ("counter", np.int64),  # unwrapped
         ("arrival_ns", np.int64),  # host clock
-        (
-            "elapsed_ns",
-            np.int64,
-        ),  # end of the interval by the counter alone, from the first sample's beginning
-        ("interval_ns", np.int64),  # that the pulses cover
+        ("elapsed_ns", np.int64),  # end of the interval by the counter, since the start of the first sample
+        ("interval_ns", np.int64),  # covered by the pulses
         ("gyro", np.int64, 3),
         ("accelerometer", np.int64, 3),
         ("temperature_degc", np.float64, MAX_TEMPERATURES),  # NaN: unknown
@@ -69,8 +60,7 @@ PULSES: Final = np.dtype(
     ],
     align=True,
 )
-"""One sample of pulse increments, accounted for."""
-
+"""One sample of pulse increments, its losses accounted for."""
 
 INCREMENTS: Final = np.dtype(
     [
@@ -84,7 +74,6 @@ INCREMENTS: Final = np.dtype(
     align=True,
 )
 """One sample of compensated increments, body axes."""
-
 
 REJECT: Final = np.dtype([("offset", np.int64), ("length", np.int64), ("reason", np.int64)])
 """A run of input that is not a frame."""
@@ -125,12 +114,12 @@ class Source(IntEnum):
 
 
 class Arrival(NamedTuple):
-    """What one read brought.
+    """Data of one read of a port.
 
     Parameters
     ----------
     t_ns : int
-        When, host clock (`imudrv.hostclock`); of a replay the recorded time.
+        Time of the read, host clock (`imudrv.hostclock`); in a replay the recorded time.
     data : bytes or ndarray of MESSAGE
         Wire bytes, or CAN messages each with its own `t_ns`; empty when the wait ended without any.
     """

@@ -1,4 +1,4 @@
-"""Place of the unit: the site file."""
+"""Location of the unit: the site file."""
 
 from typing import Annotated, Literal
 
@@ -10,7 +10,7 @@ from imudrv.units import DEG
 
 
 class Site(Model):
-    """A place on the Earth; `gravity_m_s2` is absent where it was not measured."""
+    """A location on the Earth; `gravity_m_s2` is absent if it was not measured."""
 
     format: Literal["imu50-site"] = "imu50-site"
     version: Literal[1] = 1
@@ -31,7 +31,7 @@ class Site(Model):
 
     @property
     def gravity(self) -> float:
-        """Gravity, m/s^2: the measured one, or normal gravity where there is no measurement."""
+        """Measured gravity, or else normal gravity, m/s^2."""
         if self.gravity_m_s2 is not None:
             return self.gravity_m_s2
         return normal_gravity(self.latitude_rad, self.height_m)

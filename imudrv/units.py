@@ -1,6 +1,6 @@
-"""Constants of nature and of units, each with its unit; SI and radians everywhere else.
+"""Conversion factors and constants; everything inside is in SI and radians.
 
-Multiply by a constant to come in (``30.0 * ARCSEC`` is in rad), divide to go out.
+Multiply by a factor to convert to SI (``30.0 * ARCSEC`` is in rad), divide to convert from SI.
 """
 
 from math import pi

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from samples import CERTIFICATE
 
 from imudrv.calibration import Calibration, coefficients, read_calibration, write_calibration
 from imudrv.errors import FaultyFileError, InputError
@@ -16,21 +17,9 @@ from imudrv.nav.earth import normal_gravity
 from imudrv.site import Site
 
 # The example of the files' specification.
-EXAMPLE = """\
-format: imu50-calibration
-version: 1
-serial_number: "50-0017"
-created: 2026-11-22T10:00:00Z
-gyro:
-  scale_arcsec_per_pulse: [0.5, 0.5, 0.5]
-  bias_deg_per_h: [0.0, 0.0, 0.0]
-  C_bg: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
-accelerometer:
-  scale_pulse_per_m_s: [2000.0, 2000.0, 2000.0]
-  bias_ug: [0.0, 0.0, 0.0]
-  C_ba: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+EXAMPLE = f"""{CERTIFICATE}\
 size_effect:
-  r_mm: {x: [0, 0, 0], y: [0, 0, 0], z: [0, 0, 0]}
+  r_mm: {{x: [0, 0, 0], y: [0, 0, 0], z: [0, 0, 0]}}
   gauge: centroid
 temperature:
   reference_degc: 35.0

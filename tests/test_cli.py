@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from samples import CERTIFICATE
 
 from imudrv.cli import main
 from imudrv.wire.datagram import DatagramDecoder
@@ -54,21 +55,9 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-CALIBRATION = """
-format: imu50-calibration
-version: 1
-serial_number: "50-0017"
-created: 2026-11-22T10:00:00Z
-gyro:
-  scale_arcsec_per_pulse: [0.5, 0.5, 0.5]
-  bias_deg_per_h: [0.0, 0.0, 0.0]
-  C_bg: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
-accelerometer:
-  scale_pulse_per_m_s: [2000.0, 2000.0, 2000.0]
-  bias_ug: [0.0, 0.0, 0.0]
-  C_ba: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+CALIBRATION = f"""{CERTIFICATE}\
 size_effect:
-  r_mm: {x: [24, -11, -9], y: [-23, 29, -7], z: [-1, -18, 16]}
+  r_mm: {{x: [24, -11, -9], y: [-23, 29, -7], z: [-1, -18, 16]}}
   gauge: centroid
 """
 

@@ -1,11 +1,11 @@
-"""Reading and writing files: settings in YAML, tables, atomic writes.
+"""Files: settings in YAML, tables, files that grow.
 
-model          base of the models, shared types
-settings_file  read, parse, write
+settings_file  read, check and write settings
+model          base of their models, shared types
 yaml_text      YAML within bounds
 faults         messages for faults of a settings file
-atomic         whole files or none, SHA-256
-outputs        what an output may be
+atomic         files written complete or not at all; SHA-256; changes
+outputs        checks of the names of outputs
 tables         CSV, NPZ and I50N tables
-spool          files that are appended to by a thread
+spool          files that a thread appends to
 """

@@ -1,16 +1,13 @@
-"""Read files whole and bounded; write them whole or not at all; SHA-256."""
+"""Whole files: read with a bound on their size, watched for changes, hashed; written whole or not at all."""
 
 import hashlib
 import os
 import secrets
 import stat
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
-from datetime import UTC, datetime
+from contextlib import contextmanager
 from io import BufferedReader
-from itertools import chain, count
 from pathlib import Path
-from tempfile import NamedTemporaryFile
 from typing import IO, Final
 
 from imudrv.errors import InputError
@@ -21,7 +18,7 @@ MAX_BYTES: Final = 1 << 20
 
 
 def content(path: str | os.PathLike[str]) -> bytes:
-    """Read a settings file as it is.
+    """Return the content of a settings file.
 
     Parameters
     ----------
@@ -35,10 +32,9 @@ def content(path: str | os.PathLike[str]) -> bytes:
     Raises
     ------
     InputError
-        It cannot be read or is too large.
+        The file cannot be read or is too large.
     """
-    path = Path(path)
-    with _reading(path), _open(path) as file:
+    with _open(path) as file:
         data = file.read(MAX_BYTES + 1)
     if len(data) > MAX_BYTES:
         raise InputError(
@@ -48,7 +44,7 @@ def content(path: str | os.PathLike[str]) -> bytes:
 
 
 def sha256(path: str | os.PathLike[str]) -> str:
-    """SHA-256 of a file of any size.
+    """Return the SHA-256 of a file of any size.
 
     Parameters
     ----------
@@ -65,13 +61,33 @@ def sha256(path: str | os.PathLike[str]) -> str:
     InputError
         The file cannot be read.
     """
-    path = Path(path)
-    with _reading(path), _open(path) as file:
+    with _open(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+@contextmanager
+def _open(path: str | os.PathLike[str]) -> Iterator[BufferedReader]:
+    """Open a file for reading; a system error becomes an `InputError`."""
+    path = Path(path)
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):
+            raise InputError(
+                f"{path}: expected a file, got a {'folder' if path.is_dir() else 'device or pipe'}"
+            )
+        with path.open("rb") as file:
+            yield file
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: expected a file, there is none; check the path") from error
+    except PermissionError as error:
+        raise InputError(
+            f"{path}: cannot be read: permission denied; change the permissions or the user"
+        ) from error
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
+        raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+
+
 def change_mark(path: str | os.PathLike[str]) -> tuple[int, int, int]:
-    """Time of modification (ns), size (bytes) and inode of a file: another mark, another content.
+    """Return what changes when the content of a file does.
 
     Parameters
     ----------
@@ -81,7 +97,7 @@ def change_mark(path: str | os.PathLike[str]) -> tuple[int, int, int]:
     Returns
     -------
     tuple of int
-        Zeros if there is no such file.
+        Time of modification (ns), size (bytes) and inode; zeros if there is no such file.
     """
     try:
         found = os.stat(path)
@@ -92,7 +108,7 @@ def change_mark(path: str | os.PathLike[str]) -> tuple[int, int, int]:
 
 @contextmanager
 def unchanged(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Watch a file that is read in several passes.
+    """Check that a file does not change while it is read in several passes.
 
     Parameters
     ----------
@@ -108,71 +124,19 @@ def unchanged(path: str | os.PathLike[str]) -> Iterator[None]:
     yield
     if change_mark(path) != before:
         raise InputError(
-            f"{os.fspath(path)}: expected a file that stays as it is, it was changed while it was read; "
+            f"{os.fspath(path)}: expected a file that does not change, it was changed while it was read; "
             "wait until it is complete, then try again"
         )
 
 
 @contextmanager
-def reported_errors(path: Path, done: str, missing: str) -> Iterator[None]:
-    """Turn the system's errors about `path`, which should have been `done`, into ours."""
-    try:
-        yield
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: {missing}") from error
-    except PermissionError as error:
-        raise InputError(
-            f"{path}: cannot be {done}: permission denied; change the permissions or the user"
-        ) from error
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
-        raise InputError(f"{path}: cannot be {done}: {getattr(error, 'strerror', None) or error}") from error
-
-
-def _reading(path: Path) -> AbstractContextManager[None]:
-    return reported_errors(path, "read", "expected a file, there is none; check the path")
-
-
-def _open(path: Path) -> BufferedReader:
-    if not stat.S_ISREG(path.stat().st_mode):
-        raise InputError(f"{path}: expected a file, got a {'folder' if path.is_dir() else 'device or pipe'}")
-    return path.open("rb")
-
-
-def write_whole(path: Path, data: bytes) -> None:
-    """Put `data` at `path` in one step that survives a loss of power."""
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
-    try:
-        with temporary.open("xb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
-
-
-def backup_name(path: Path) -> Path:
-    """Find a free name for the file that is at `path`, by its time."""
-    time = datetime.fromtimestamp(path.stat().st_mtime, UTC)
-    stem = f"{path.stem}.{time:%Y%m%dT%H%M%SZ}"
-    names = chain([stem], (f"{stem}.{n}" for n in count(2)))
-    return next(kept for name in names if not os.path.lexists(kept := path.with_name(name + path.suffix)))
-
-
-@contextmanager
 def atomic_write(path: Path) -> Iterator[IO[bytes]]:
-    """A file that takes its name only once it is whole.
+    """Write a file under another name beside it, and give it its own once it is complete and on the disk.
 
     Parameters
     ----------
     path : Path
-        Its name; what has that name stays until then. A symbolic link is followed.
+        Its name; a file that has that name stays until then. A symbolic link is followed.
 
     Yields
     ------
@@ -182,24 +146,46 @@ def atomic_write(path: Path) -> Iterator[IO[bytes]]:
     Raises
     ------
     InputError
-        The folder is not there or cannot be written to, the disk is full, or see `file_to_write`.
+        The folder does not exist or cannot be written to, the disk is full, or see `file_to_write`.
     """
     target = file_to_write(path)
-    file: IO[bytes] | None = None
+    temporary: Path | None = None
     try:
-        with NamedTemporaryFile(dir=target.parent, prefix=f".{target.name}.", delete=False) as file:
+        with (beside := target.with_name(f".{target.name}.{secrets.token_hex(4)}")).open("xb") as file:
+            temporary = beside
             yield file
-        os.chmod(file.name, 0o666 & ~_umask())
-        os.replace(file.name, target)
-        file = None
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(target)
+        temporary = None
+        sync_folder(target.parent)
     except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
+        reason = str(error.strerror or error)
+        if not target.parent.is_dir():
+            reason = f"expected the folder {path.parent}, there is none; make it first"
+        elif isinstance(error, PermissionError):
+            reason = "permission denied; change the permissions or the user"
+        raise InputError(f"{path}: cannot be written: {reason}") from error
     finally:
-        if file is not None:
-            Path(file.name).unlink(missing_ok=True)
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
 
 
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+def sync_folder(folder: Path) -> None:
+    """Wait until the names in a folder are on the disk.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder.
+
+    Raises
+    ------
+    OSError
+        The system cannot do it.
+    """
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

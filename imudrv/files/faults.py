@@ -1,4 +1,4 @@
-"""Messages for the faults of a settings file: place, expected, got."""
+"""Messages for faults of a settings file: where, what was expected, what was found."""
 
 import difflib
 import re
@@ -10,12 +10,9 @@ from pydantic import ValidationError
 from imudrv.files.model import Model
 
 MAX_FAULTS: Final = 50
-"""Most faults that one message tells."""
-
+"""Largest number of faults in one message."""
 
 _TIME: Final = "a time in the way of 2026-11-22T10:00:00Z"
-
-
 _EXPECTED: Final = {
     "float_type": "a number",
     "finite_number": "a finite number",
@@ -41,12 +38,11 @@ _EXPECTED: Final = {
     "timezone_aware": f"{_TIME}, with its zone",
 }
 
-
 _Place: TypeAlias = tuple[str | int, ...]
 
 
 def header_faults(document: object, model: type[Model]) -> Iterator[str]:
-    """Compare `format` and `version` by type too: pydantic takes true and 1.0 for 1."""
+    """Yield the faults of `format` and `version`, compared by type too: pydantic takes true and 1.0 for 1."""
     for name in ("format", "version"):
         field = model.model_fields.get(name)
         if field is None or get_origin(field.annotation) is not Literal:
@@ -59,38 +55,38 @@ def header_faults(document: object, model: type[Model]) -> Iterator[str]:
 
 
 def validation_faults(error: ValidationError, document: object, model: type[Model]) -> list[str]:
-    """Put what pydantic found into sentences, one for each place."""
-    told: dict[tuple[str, str], list[str]] = {}
+    """Return the errors of pydantic as sentences, one for each place."""
+    found: dict[tuple[str, str], list[str]] = {}  # what was expected, by place and what came
     for place, e in _located(error.errors(include_url=False), document):
         where, name, came, values = _path(place), e["type"], e["input"], e.get("ctx", {})
         if name == "extra_forbidden":
-            told[where, _unknown_key(str(place[-1]), _keys(model, place[:-1]))] = []
+            found[where, _unknown_key(str(place[-1]), _keys(model, place[:-1]))] = []
         elif name == "missing" and isinstance(place[-1], int):
-            # One error for each absent place of a tuple, in order: the last one tells the length.
-            told[_path(place[:-1]), str(len(came))] = [f"{place[-1] + 1} {_things(came)}"]
+            # One error for each absent item of a tuple, in order: the last one gives the length.
+            found[_path(place[:-1]), str(len(came))] = [f"{place[-1] + 1} {_plural(came)}"]
         elif name == "missing":
-            told[where, "missing; add it"] = []
+            found[where, "missing; add it"] = []
         elif name == "too_short" and len(came) >= values["min_length"]:
-            continue  # pydantic counts the good items only; the bad ones are told on their own
+            continue  # pydantic counts valid items only; the others have errors of their own
         elif name in ("too_short", "too_long"):
             limit = "at least {min_length}" if name == "too_short" else "at most {max_length}"
-            told[where, str(len(came))] = [f"{limit.format(**values)} {_things(came)}"]
+            found[where, str(len(came))] = [f"{limit.format(**values)} {_plural(came)}"]
         elif name == "value_error":
-            told[where, str(values["error"])] = []
+            found[where, str(values["error"])] = []
         elif name in _EXPECTED:
             quotes = "; put it in quotes" if name == "string_type" and isinstance(came, int | float) else ""
-            told.setdefault((where, shown_value(came) + quotes), []).append(_EXPECTED[name].format(**values))
+            found.setdefault((where, shown_value(came) + quotes), []).append(_EXPECTED[name].format(**values))
         else:
-            told[where, f"{e['msg']}, got {shown_value(came)}"] = []
+            found[where, f"{e['msg']}, got {shown_value(came)}"] = []
     return [
         (f"{where}: " if where else "")
         + (f"expected {' or '.join(dict.fromkeys(expected))}, got {rest}" if expected else rest)
-        for (where, rest), expected in told.items()
+        for (where, rest), expected in found.items()
     ]
 
 
 def _located(errors: Sequence[Any], document: object) -> Iterator[tuple[_Place, Any]]:
-    """Yield each error with its place in the document; of a union only the alternatives that fit best."""
+    """Yield each error with its place in the document; for a union only those of the best alternatives."""
     found = [(*_place(e, document), e) for e in errors]
     misfit: dict[tuple[_Place, str | int], tuple[bool, int]] = {}
     for place, branch, e in found:
@@ -107,12 +103,12 @@ def _located(errors: Sequence[Any], document: object) -> Iterator[tuple[_Place, 
 
 
 def _place(error: Any, document: object) -> tuple[_Place, tuple[_Place, str | int] | None]:
-    """Tell where an error is, and the first alternative of a union on the way (pydantic puts it in loc)."""
+    """Return the place of an error, and the first alternative of a union on the way to it."""
     place: list[str | int] = []
     branch = None
     here: Any = document
     for i, step in enumerate(error["loc"]):
-        if _leads_on(here, step):
+        if _has_step(here, step):
             place.append(step)
             here = here[step]
         elif error["type"] == "missing" and i == len(error["loc"]) - 1:
@@ -122,14 +118,14 @@ def _place(error: Any, document: object) -> tuple[_Place, tuple[_Place, str | in
     return tuple(place), branch
 
 
-def _leads_on(here: object, step: str | int) -> bool:
+def _has_step(here: object, step: str | int) -> bool:
     if isinstance(here, Mapping):
         return step in here
     return isinstance(here, list | tuple) and step in range(len(here))
 
 
 def _keys(annotation: Any, place: _Place) -> set[str]:
-    """Tell the keys that the model knows at a place."""
+    """Return the keys that a model has at a place."""
     if isinstance(annotation, type) and issubclass(annotation, Model):
         fields = annotation.model_fields
         if not place:
@@ -156,7 +152,7 @@ def quoted_name(key: str) -> str:
 
 
 def _short(value: object) -> str:
-    """Represent a value in less than a line, with no control characters."""
+    """Return a value in less than a line, without control characters."""
     text = repr(value[:60] if isinstance(value, str) else value)
     return text if len(text) <= 60 else f"{text[:57]}..."
 
@@ -174,13 +170,13 @@ def shown_value(value: object) -> str:
     return f"a list of {len(value)}" if isinstance(value, list | tuple) else _short(value)
 
 
-def _things(items: Sequence[object]) -> str:
+def _plural(items: Sequence[object]) -> str:
     if all(isinstance(item, int | float) for item in items):
         return "numbers"
     return "rows" if all(isinstance(item, list | tuple) for item in items) else "values"
 
 
 def bounded(faults: list[str]) -> list[str]:
-    """Return at most `MAX_FAULTS` faults, and how many more there are."""
+    """Return at most `MAX_FAULTS` faults, then the number of the others."""
     rest = len(faults) - MAX_FAULTS
     return [*faults[:MAX_FAULTS], f"and {rest} more"] if rest > 0 else faults

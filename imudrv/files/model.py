@@ -9,7 +9,7 @@ from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict
 class Model(BaseModel):
     """A section of a settings file; frozen.
 
-    Unknown keys, NaN and infinity are refused, and text or true/false where a number is meant.
+    Unknown keys, NaN and infinity are refused, and text or true/false instead of a number.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
@@ -24,12 +24,8 @@ def _utc(time: datetime) -> datetime:
 UtcTime: TypeAlias = Annotated[AwareDatetime, AfterValidator(_utc)]
 """A time with its zone, kept in UTC."""
 
-
 Vector3: TypeAlias = tuple[float, float, float]
-
-
 Matrix3: TypeAlias = tuple[Vector3, Vector3, Vector3]
 """Three rows."""
-
 
 M = TypeVar("M", bound=Model)

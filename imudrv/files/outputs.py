@@ -1,7 +1,6 @@
-"""Where a command may write: the name of an output, checked before anything is written.
+"""Names of outputs, checked before anything is written.
 
-An output takes its name at the end, in place of what has that name then. So a device, a pipe or a folder is
-refused, which would be replaced by a file, and so is an input.
+An output replaces what has its name. So a device, a pipe, a folder or an input of the command is refused.
 """
 
 import os
@@ -16,17 +15,17 @@ _STANDARD_OUTPUT: Final = ("-", "/dev/stdout")
 
 
 def is_standard_output(path: Path) -> bool:
-    """Whether a name means standard output: ``-`` or ``/dev/stdout``."""
+    """Return whether a name means standard output: ``-`` or ``/dev/stdout``."""
     return str(path) in _STANDARD_OUTPUT
 
 
 def file_to_write(path: Path) -> Path:
-    """Return the file that an output goes to: the name itself, or where it links to.
+    """Return the file of an output: the name itself, or the target of the link.
 
     Parameters
     ----------
     path : Path
-        As the user gave it; there need be no such file yet.
+        The name that the user gave; the file need not exist.
 
     Returns
     -------
@@ -36,7 +35,7 @@ def file_to_write(path: Path) -> Path:
     Raises
     ------
     InputError
-        It is standard output, a folder, a device, a pipe or a socket, or cannot be looked at.
+        It is standard output, a folder, a device, a pipe or a socket, or cannot be examined.
     """
     if is_standard_output(path):
         raise InputError(f"{path}: expected a file, for this output cannot go to standard output")
@@ -52,19 +51,19 @@ def file_to_write(path: Path) -> Path:
 
 
 def require_other(path: Path, *inputs: str | Path | None) -> None:
-    """Refuse an output that is one of its inputs, under whatever name.
+    """Refuse an output that is one of the inputs, under any name.
 
     Parameters
     ----------
     path : Path
         The output.
     inputs : str, Path or None
-        Files; what is None or no file is passed over.
+        Inputs; None and names of no file are ignored.
 
     Raises
     ------
     InputError
-        Names both.
+        The output is an input; the message names both.
     """
     output = Path("/dev/stdout") if is_standard_output(path) else path
     for given in inputs:

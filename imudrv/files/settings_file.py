@@ -1,47 +1,33 @@
-"""The YAML edge: every settings file of ours comes in and goes out here, checked whole.
-
-A file is plain data: mappings, lists, text, numbers, true/false, null. Unquoted values follow the core schema
-of YAML 1.2: ``1e-6`` is a number; ``0017``, ``1:30``, ``yes`` and a date are text. Anchors, aliases, tags and
-keys given twice are refused.
-"""
+"""Settings files: YAML, checked against a `Model` when read, written so that a crash loses nothing."""
 
 import hashlib
 import json
-import math
 import os
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import UTC, datetime
+from itertools import chain, count
 from pathlib import Path
 from typing import Generic
 
-import yaml
 from pydantic import ValidationError
 
 from imudrv.errors import FaultyFileError, InputError
-from imudrv.files.atomic import MAX_BYTES, backup_name, content, reported_errors, write_whole
+from imudrv.files.atomic import MAX_BYTES, atomic_write, content
 from imudrv.files.faults import bounded, header_faults, shown_value, validation_faults
 from imudrv.files.model import M, Model
 from imudrv.files.outputs import file_to_write
-from imudrv.files.yaml_text import (
-    FLOAT,
-    Dumper,
-    load_yaml,
-    represent_sequence,
-    represent_text,
-    represent_time,
-)
+from imudrv.files.yaml_text import dump_yaml, load_yaml
 
 
 @dataclass(frozen=True)
 class SettingsFile(Generic[M]):
-    """A settings file as one read found it; whatever happens to the file, the three agree.
+    """One reading of a settings file; content, hash and model belong together even if the file changes.
 
     Attributes
     ----------
     content : bytes
-        The file as it is.
+        The bytes of the file.
     sha256 : str
         SHA-256 of the content, 64 hexadecimal digits.
     model : Model
@@ -54,14 +40,14 @@ class SettingsFile(Generic[M]):
 
 
 def read_file(path: str | os.PathLike[str], model: type[M]) -> SettingsFile[M]:
-    """Read and check a settings file, and keep its content; see `read`.
+    """Read and check a settings file, with its content and hash; see `read`.
 
     Parameters
     ----------
     path : path-like
         The file.
     model : subclass of Model
-        What it should be.
+        Kind of file that is expected.
 
     Returns
     -------
@@ -79,7 +65,7 @@ def read(path: str | os.PathLike[str], model: type[M]) -> M:
     path : path-like
         The file: YAML, UTF-8, at most `MAX_BYTES`.
     model : subclass of Model
-        What it should be.
+        Kind of file that is expected.
 
     Returns
     -------
@@ -90,22 +76,22 @@ def read(path: str | os.PathLike[str], model: type[M]) -> M:
     InputError
         The file cannot be read.
     FaultyFileError
-        It is no YAML, or not what the model says; all faults at once.
+        It is no YAML, or does not fit the model; all faults at once.
     """
     return read_file(path, model).model
 
 
 def parse_text(text: bytes, model: type[M], name: str) -> M:
-    """Read and check settings that are in memory already; see `read`.
+    """Check the text of a settings file; see `read`.
 
     Parameters
     ----------
     text : bytes
         YAML, UTF-8.
     model : subclass of Model
-        What it should be.
+        Kind of file that is expected.
     name : str
-        What messages call it.
+        Name of the file in messages.
 
     Returns
     -------
@@ -115,16 +101,17 @@ def parse_text(text: bytes, model: type[M], name: str) -> M:
 
 
 def parse(document: object, model: type[M], name: str) -> M:
-    """Check data that is loaded already.
+    """Check the document of a settings file.
 
     Parameters
     ----------
     document : object
         Mappings, lists, text, numbers, dates.
     model : subclass of Model
-        What it should be. A wrong `format` or `version` is told alone: the rest is then another file's.
+        Kind of file that is expected. A wrong `format` or `version` is the only fault reported: the rest then
+        belongs to another kind of file.
     name : str
-        What messages call it.
+        Name of the file in messages.
 
     Returns
     -------
@@ -133,7 +120,7 @@ def parse(document: object, model: type[M], name: str) -> M:
     Raises
     ------
     FaultyFileError
-        It is not what the model says; all faults at once.
+        It does not fit the model; all faults at once.
     """
     if faults := list(header_faults(document, model)):
         raise FaultyFileError(name, faults)
@@ -145,7 +132,7 @@ def parse(document: object, model: type[M], name: str) -> M:
 
 
 def kind(path: str | os.PathLike[str]) -> str:
-    """Tell what a settings file is: the value of its `format`; a site file may lack it.
+    """Return the kind of a settings file: its `format`, which a site file may lack.
 
     Parameters
     ----------
@@ -160,7 +147,7 @@ def kind(path: str | os.PathLike[str]) -> str:
     Raises
     ------
     InputError
-        The file cannot be read, is no YAML, or does not say what it is.
+        The file cannot be read, is no YAML, or has no format.
     """
     name = os.fspath(path)
     document = load_yaml(content(path), name)
@@ -178,55 +165,51 @@ def kind(path: str | os.PathLike[str]) -> str:
 
 
 def write(path: str | os.PathLike[str], document: Model | Mapping[str, object]) -> None:
-    """Write a settings file so that at every moment the old or the new one is there, whole.
+    """Write a settings file so that at every moment the old or the new one exists, complete.
 
-    The file that was there is kept beside it under its name and time, ``NAME.20261122T100000Z.yaml``, with
-    ``.2``, ``.3`` ... behind the time where that is taken. A symbolic link is followed.
+    The previous file is kept beside it under its name and time, ``NAME.20261122T100000Z.yaml``, with ``.2``,
+    ``.3`` ... after the time where that is taken. A symbolic link is followed.
 
     Parameters
     ----------
     path : path-like
         The file.
     document : Model or mapping
-        What it becomes: keys in the model's order, absent options left out, floats that come back exactly.
+        Its new contents: keys in the model's order, absent options left out, floats exact.
 
     Raises
     ------
     InputError
-        It cannot be written, what is there is no settings file but too large, or see `file_to_write`.
+        It cannot be written, the existing file is too large for a settings file, or see `file_to_write`.
     """
     path = Path(path)
     target = file_to_write(path)
-    data = yaml.dump(
-        _plain(document), Dumper=Dumper, sort_keys=False, allow_unicode=True, width=math.inf
-    ).encode()
+    data = dump_yaml(_plain(document))
     if len(data) > MAX_BYTES:
         raise InputError(
             f"{path}: expected at most {MAX_BYTES} bytes to write, got {len(data)}; shorten the contents"
         )
-    load_yaml(data, str(path))  # what is written can be read
-    with reported_errors(path, "written", f"expected the folder {path.parent}, there is none; make it first"):
-        if target.exists():
-            write_whole(backup_name(target), content(target))
-        write_whole(target, data)
+    load_yaml(data, str(path))  # never write a file that cannot be read
+    if target.exists():
+        _write(_backup_name(target), content(target))
+    _write(path, data)
 
 
-Dumper.add_representer(str, represent_text)
+def _write(path: Path, data: bytes) -> None:
+    with atomic_write(path) as file:
+        file.write(data)
 
 
-Dumper.add_representer(list, represent_sequence)
-
-
-Dumper.add_representer(datetime, represent_time)
-
-
-# Text that only YAML 1.2 takes for a number (1e5) needs its quotes too.
-Dumper.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(f"({FLOAT.pattern})$"), list("-+.0123456789")
-)
+def _backup_name(path: Path) -> Path:
+    """Return a free name for a copy of the file, by the time of its modification."""
+    time = datetime.fromtimestamp(path.stat().st_mtime, UTC)
+    stem = f"{path.stem}.{time:%Y%m%dT%H%M%SZ}"
+    names = chain([stem], (f"{stem}.{n}" for n in count(2)))
+    return next(free for name in names if not os.path.lexists(free := path.with_name(name + path.suffix)))
 
 
 def _plain(value: object) -> object:
+    """Return models as mappings without absent options, tuples as lists."""
     if isinstance(value, Model):
         fields = ((name, getattr(value, name)) for name in type(value).model_fields)
         return {name: _plain(field) for name, field in fields if field is not None}

@@ -1,4 +1,4 @@
-"""A new file that a thread of its own appends to, so that no disk holds the loop."""
+"""A file that a thread of its own appends to, so that a slow disk does not stop the live loop."""
 
 import errno
 import os
@@ -12,29 +12,23 @@ from imudrv.errors import InputError
 from imudrv.files.outputs import file_to_write
 
 PERIOD_S: Final = 0.05
-"""What waits is written this often."""
-
-
-_PAUSE_S: Final = 0.002  # between the pieces of a backlog, for the loop to come through
-
-
-_LAST_SECONDS_S: Final = 5.0
-
-
+"""Period of writing, s."""
+_PAUSE_S: Final = 0.002  # between the pieces of a backlog, so that the loop runs meanwhile
+_CLOSE_TIMEOUT_S: Final = 5.0
 _FULL: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class Piece(NamedTuple):
-    """What is written at a time.
+    """Data of one write.
 
     Parameters
     ----------
     data : bytes
-        Not too long; empty when nothing waits.
+        Bytes of bounded length; empty if nothing waits.
     samples : int
-        In it.
+        Number of samples in it.
     more : bool
-        Whether more waits already, so that the next piece does not wait for the next round.
+        Whether more waits already, so that the next piece is written at once.
     """
 
     data: bytes
@@ -48,25 +42,25 @@ _NOTHING: Final = Piece(b"", 0, False)
 class AppendThread:
     """Writer of one new file.
 
-    A piece goes to the system at once and outlives this process; it goes in whole or, where the disk takes
-    only a part, that part is taken back and the piece tried again. So the file ends with a whole piece at
-    all times but the middle of a write.
+    Each piece is handed to the system at once and survives the end of this process. If the disk takes only a
+    part of it, that part is removed and the piece written again, so that the file ends with a complete piece
+    at all times except during a write.
 
     Parameters
     ----------
     path : Path
-        There must be no such file yet.
+        The file, which must not exist.
     head : bytes
-        What the file begins with, written at once.
+        Beginning of the file, written at once.
     next_piece : callable
-        Gives the next piece. Called in the thread.
+        Returns the next piece; called in the thread.
     last_piece : callable
-        Gives what ends the file.
+        Returns the end of the file; called in the thread.
 
     Raises
     ------
     InputError
-        There is such a file, the folder cannot be written to, there is no room for the head, or see
+        The file exists, the folder cannot be written to, there is no room for the head, or see
         `file_to_write`.
     """
 
@@ -101,15 +95,15 @@ class AppendThread:
 
     @property
     def trouble(self) -> str:
-        """What is wrong: ``disk full``, what the system says; empty when all is well."""
+        """Current error: ``disk full`` or the message of the system; empty without one."""
         if not self._thread.is_alive() and not self._is_closing.is_set():
             return "the writer has stopped"
         return self._trouble
 
     def close(self) -> None:
-        """Write what waits, for some seconds at the most, and let go."""
+        """Write what waits, within a few seconds, and close the file."""
         self._is_closing.set()
-        self._thread.join(_LAST_SECONDS_S)
+        self._thread.join(_CLOSE_TIMEOUT_S)
 
     def _run(self) -> None:
         piece = _NOTHING
@@ -130,7 +124,7 @@ class AppendThread:
         os.close(self._file)
 
     def _append(self, piece: bytes) -> bool:
-        """Append a piece; whether it is in the file."""
+        """Append a piece; return whether it is in the file."""
         rest = memoryview(piece)
         try:
             while rest:

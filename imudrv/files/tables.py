@@ -1,7 +1,7 @@
-"""Pulses and increments into files: `.csv`, `.npz`, and `.i50n` datagrams; the suffix says which.
+"""Files of pulses and increments: `.csv`, `.npz`, or `.i50n` datagrams, by the suffix of the name.
 
-A file appears whole under its name or not at all: it is written beside it and renamed at the end. All three
-are written as the data comes, so that a capture of any length needs little memory.
+A file appears complete or not at all. All three are written piece by piece, so that a capture of any length
+needs little memory.
 """
 
 import shutil
@@ -24,30 +24,25 @@ from imudrv.wire.layout import Layout
 
 Columns = Mapping[str, NDArray[np.generic]]
 
-
 _IN_RECORD: Final = {"dtheta": "dtheta_b", "dv": "dv_b"}
-
-
 _AXES: Final = ("x", "y", "z")
-
-
 _STANDARD_OUTPUT: Final = 1  # its file descriptor
 
 
 def pulse_columns(pulses: Records, layout: Layout) -> Columns:
-    """Columns of decoded pulses.
+    """Return the columns of decoded pulses.
 
     Parameters
     ----------
     pulses : ndarray of PULSES
         Decoded.
     layout : Layout
-        Of the profile: how many temperatures there are.
+        Layout of the profile, with the number of temperatures.
 
     Returns
     -------
     mapping of str to ndarray
-        Each with one row a sample.
+        One row a sample.
     """
     return {
         "counter": pulses["counter"],
@@ -61,7 +56,7 @@ def pulse_columns(pulses: Records, layout: Layout) -> Columns:
 
 
 def increment_columns(increments: Records) -> Columns:
-    """Columns of compensated increments, body axes.
+    """Return the columns of compensated increments, body axes.
 
     Parameters
     ----------
@@ -71,7 +66,7 @@ def increment_columns(increments: Records) -> Columns:
     Returns
     -------
     mapping of str to ndarray
-        Each with one row a sample.
+        One row a sample.
     """
     return {
         "counter": increments["counter"],
@@ -94,14 +89,14 @@ class Table(Protocol):
 
 
 class CsvTable:
-    """Text with a header line; its numbers read back to the same bits.
+    """Text with a header line; numbers are read back to the same bits.
 
     Parameters
     ----------
     file : binary file
         Open for writing.
     parts : mapping of str to sequence of str
-        What the parts of a column are called where they are not x, y, z.
+        Names of the parts of a column, where they are not x, y, z.
     """
 
     def __init__(self, file: IO[bytes], parts: Mapping[str, Sequence[str]]) -> None:
@@ -110,7 +105,7 @@ class CsvTable:
         self._begun = False
 
     def write(self, columns: Columns) -> None:
-        """Append rows; the first ones bring the header."""
+        """Append rows; the first call writes the header."""
         names: list[str] = []
         flat: list[list[object]] = []
         for name, column in columns.items():
@@ -126,18 +121,18 @@ class CsvTable:
         self._file.write("".join(",".join(map(repr, row)) + "\n" for row in zip(*flat, strict=True)).encode())
 
     def finish(self) -> None:
-        """Nothing is held back."""
+        """Do nothing: all rows are written."""
 
 
 class NpzTable:
-    """numpy's archive, one array a column; the columns grow in temporary files beside it.
+    """Archive of numpy, one array a column; columns are collected in temporary files.
 
     Parameters
     ----------
     file : binary file
         Open for writing.
     folder : Path
-        Where the temporary files may be.
+        Folder of the temporary files.
     """
 
     def __init__(self, file: IO[bytes], folder: Path) -> None:
@@ -157,7 +152,7 @@ class NpzTable:
         self._rows += len(next(iter(columns.values())))
 
     def finish(self) -> None:
-        """Put the columns together."""
+        """Write the archive."""
         with self._open, zipfile.ZipFile(self._file, "w", zipfile.ZIP_STORED) as archive:
             for name, (grown, dtype, shape) in self._columns.items():
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
@@ -175,7 +170,7 @@ class DatagramTable:
     file : binary file
         Open for writing.
     source : Source
-        Where the samples come from.
+        Origin of the samples.
     """
 
     def __init__(self, file: IO[bytes], source: Source) -> None:
@@ -190,21 +185,21 @@ class DatagramTable:
         self._file.write(encode(increments, self._source))
 
     def finish(self) -> None:
-        """Nothing is held back."""
+        """Do nothing: all rows are written."""
 
 
 @contextmanager
 def table(path: Path, kinds: Sequence[str], parts: Mapping[str, Sequence[str]]) -> Iterator[Table]:
-    """A file for rows, by the suffix of its name; it appears at the end, whole, or not at all.
+    """Open a file for rows, of the kind of its suffix; it appears at the end, complete, or not at all.
 
     Parameters
     ----------
     path : Path
-        Where; standard output takes ``.csv``, as it comes.
+        The file; standard output takes ``.csv``, piece by piece.
     kinds : sequence of str
-        The suffixes that make sense for what is written.
+        Suffixes that are possible for these rows.
     parts : mapping of str to sequence of str
-        For `CsvTable`.
+        See `CsvTable`.
 
     Yields
     ------
@@ -235,7 +230,7 @@ def table(path: Path, kinds: Sequence[str], parts: Mapping[str, Sequence[str]]) 
 
 @contextmanager
 def writing(path: Path) -> Iterator[IO[bytes]]:
-    """Standard output where the name means that, and a file as of `atomic_write` otherwise.
+    """Open standard output if the name means that, or else a file as `atomic_write` does.
 
     Parameters
     ----------
@@ -252,14 +247,14 @@ def writing(path: Path) -> Iterator[IO[bytes]]:
     InputError
         See `atomic_write`; or standard output is closed or full.
     BrokenPipeError
-        The reader of standard output has left.
+        The reader of standard output has closed it.
     """
     if not is_standard_output(path):
         with atomic_write(path) as file:
             yield file
         return
     try:
-        # A buffer of its own: what a full disk does not take must not be tried again at exit.
+        # Its own buffer: data that a full disk does not take must not be written again at exit.
         with open(_STANDARD_OUTPUT, "wb", closefd=False) as file:
             yield file
     except BrokenPipeError:

@@ -1,4 +1,8 @@
-"""YAML within bounds: plain data in, plain data out, nothing executed."""
+"""YAML within bounds: plain data in, plain data out, nothing executed.
+
+Unquoted values follow the core schema of YAML 1.2: ``1e-6`` is a number; ``0017``, ``1:30``, ``yes`` and a
+date are text. Anchors, aliases, tags and duplicate keys are refused.
+"""
 
 import math
 import re
@@ -14,21 +18,12 @@ from imudrv.files.faults import bounded, quoted_name
 
 MAX_DEPTH: Final = 32
 """Deepest nesting of lists and mappings."""
-
-
 MAX_EVENTS: Final = 50_000
-"""Most values, beginnings and ends of lists and mappings."""
-
+"""Largest number of values, and beginnings and ends of lists and mappings."""
 
 _PARSER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-
-
 _INT = re.compile(r"[-+]?(0|[1-9][0-9]{0,19})|0x[0-9a-fA-F]{1,16}")
-
-
-FLOAT = re.compile(r"[-+]?((0|[1-9][0-9]*)(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?")
-
-
+_FLOAT = re.compile(r"[-+]?((0|[1-9][0-9]*)(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?")
 _WORDS: Final[dict[str, bool | float | None]] = {
     **dict.fromkeys(("", "~", "null", "Null", "NULL"), None),
     **dict.fromkeys(("true", "True", "TRUE"), True),
@@ -39,11 +34,29 @@ _WORDS: Final[dict[str, bool | float | None]] = {
 
 
 class _UnusableError(Exception):
-    """Reading on makes no sense."""
+    """A fault after which the rest cannot be read."""
 
 
 def load_yaml(data: bytes, name: str) -> object:
-    """Parse YAML within bounds; raise all faults at once."""
+    """Parse YAML within bounds.
+
+    Parameters
+    ----------
+    data : bytes
+        UTF-8.
+    name : str
+        Name of the file in messages.
+
+    Returns
+    -------
+    object
+        Mappings, lists, text, numbers, true/false, None.
+
+    Raises
+    ------
+    FaultyFileError
+        It is no such YAML; all faults at once.
+    """
     faults: list[str] = []
     try:
         document = _document(_events(data.decode("utf-8")), faults)
@@ -75,25 +88,25 @@ def _events(text: str) -> Iterator[Any]:
 
 
 def _document(events: Iterator[Any], faults: list[str]) -> object:
-    next(events)  # the stream begins
+    next(events)  # stream start
     if isinstance(next(events), yaml.StreamEndEvent):
         return None
     document = _value(next(events), events, 0, faults)
-    next(events)  # the document ends
+    next(events)  # document end
     if not isinstance(rest := next(events), yaml.StreamEndEvent):
-        faults.append(f"{_line(rest.start_mark)}: expected one document, got a second one; take it out")
+        faults.append(f"{_line(rest.start_mark)}: expected one document, got a second one; remove it")
     return document
 
 
 def _value(event: Any, events: Iterator[Any], depth: int, faults: list[str]) -> object:
-    """Build the value that begins with `event`."""
+    """Return the value that begins with `event`."""
     line = _line(event.start_mark)
     if event.anchor is not None:
         faults.append(f"{line}: expected a value, got an anchor (&) or alias (*); write the value out")
     if isinstance(event, yaml.AliasEvent):
         return None
     if event.tag is not None:
-        faults.append(f"{line}: expected a value, got a tag (!); take it out, quote what is text")
+        faults.append(f"{line}: expected a value, got a tag (!); remove it, put text in quotes")
     if isinstance(event, yaml.ScalarEvent):
         return _scalar(event.value) if event.implicit[0] else event.value
     if depth == MAX_DEPTH:
@@ -116,39 +129,59 @@ def _until(end: type, events: Iterator[Any]) -> Iterator[Any]:
 
 
 def _scalar(text: str) -> bool | float | str | None:
-    """Read an unquoted value; whole numbers of more than 20 digits become floats."""
+    """Return an unquoted value; integers of more than 20 digits become floats."""
     if text in _WORDS:
         return _WORDS[text]
     if _INT.fullmatch(text):
         return int(text, 16 if "x" in text else 10)
-    return float(text) if FLOAT.fullmatch(text) else text
+    return float(text) if _FLOAT.fullmatch(text) else text
 
 
 def _line(mark: Any) -> str:
     return f"line {mark.line + 1}, column {mark.column + 1}"
 
 
-class Dumper(yaml.SafeDumper):
-    """Writer of YAML without aliases."""
+def dump_yaml(document: object) -> bytes:
+    """Write plain data as YAML that `load_yaml` reads back.
 
+    Parameters
+    ----------
+    document : object
+        Mappings, lists, text, numbers, dates, true/false, None.
+
+    Returns
+    -------
+    bytes
+        UTF-8; mappings in their order, floats exact, lists of plain values in one row.
+    """
+    text = yaml.dump(document, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=math.inf)
+    return text.encode()
+
+
+class _Dumper(yaml.SafeDumper):
     def ignore_aliases(self, data: object) -> bool:
-        """Write every value in full."""
         return True
 
 
-def represent_sequence(dumper: Dumper, items: list[object]) -> yaml.Node:
-    """Write a list of plain values in one row."""
+def _represent_list(dumper: _Dumper, items: list[object]) -> yaml.Node:
     row = not any(isinstance(item, list | dict) for item in items)
     return dumper.represent_sequence("tag:yaml.org,2002:seq", items, flow_style=row)
 
 
-def represent_time(dumper: Dumper, time: datetime) -> yaml.Node:
-    """Write a time in UTC."""
+def _represent_time(dumper: _Dumper, time: datetime) -> yaml.Node:
     text = time.astimezone(UTC).isoformat().replace("+00:00", "Z")
     return dumper.represent_scalar("tag:yaml.org,2002:timestamp", text)
 
 
-def represent_text(dumper: Dumper, text: str) -> yaml.Node:
-    """Write text, quoted where it needs to be."""
-    # Quoted and escaped, because the emitter loses breaks of line that only Unicode knows.
+def _represent_text(dumper: _Dumper, text: str) -> yaml.Node:
+    # Quoted and escaped, because the emitter loses line breaks that only Unicode knows.
     return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=None if text.isprintable() else '"')
+
+
+_Dumper.add_representer(str, _represent_text)
+_Dumper.add_representer(list, _represent_list)
+_Dumper.add_representer(datetime, _represent_time)
+# Text that only YAML 1.2 takes for a number (1e5) needs its quotes too.
+_Dumper.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(f"({_FLOAT.pattern})$"), list("-+.0123456789")
+)

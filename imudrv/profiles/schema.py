@@ -14,22 +14,14 @@ _AXES = ("x", "y", "z")
 _CLASSIC_BITS = 44
 """Bits of a classic CAN frame with an identifier of 11 bits, without its data (ISO 11898-1)."""
 _FD_SLOW_BITS, _FD_FAST_BITS = 29, 30
-"""Bits of a CAN FD frame at each rate, without its data: about, for the CRC's length varies."""
+"""Bits of a CAN FD frame at each rate, without its data; approximate, because the CRC's length varies."""
 _CAN_FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 
 
 NumberType = Literal["u8", "i8", "u16", "i16", "u24", "i24", "u32", "i32"]
-
-
 Offset = Annotated[int, Key(ge=0, le=4095)]
-
-
 Byte = Annotated[int, Key(ge=0, le=255)]
-
-
 Hex = Annotated[str, Key(pattern=r"^[ \t]*([0-9A-Fa-f]{2}[ \t]*)+$", max_length=64)]
-
-
 Name = Annotated[str, Key(pattern=r"^[A-Za-z0-9_.-]+$", max_length=64)]
 
 
@@ -50,7 +42,7 @@ class Number(Model):
     degc_at_zero: Annotated[float, Key(ge=-1000, le=1000)] = 0.0
 
     @model_validator(mode="after")
-    def _named_whole(self) -> Self:
+    def _axis_and_sensor_fit_the_name(self) -> Self:
         if (self.axis is not None) != (self.name in ("gyro", "accelerometer")):
             raise ValueError("expected 'axis' with gyro and accelerometer, and with nothing else")
         if (self.sensor is not None) != (self.name == "temperature"):
@@ -64,14 +56,14 @@ class Number(Model):
 
 
 class Constant(Model):
-    """A byte that never changes."""
+    """A byte that is the same in every message."""
 
     offset: Offset
     value: Byte
 
 
 class Check(Model):
-    """CRC or sum over the bytes `first` to `last`, both included; its value is at `offset`."""
+    """CRC or sum of the bytes `first` to `last`, inclusive; its value is at `offset`."""
 
     kind: Literal["crc", "sum"]
     width: Literal[8, 16, 32]
@@ -85,7 +77,7 @@ class Check(Model):
     prefix: Hex | None = None
 
     @model_validator(mode="after")
-    def _makes_sense(self) -> Self:
+    def _is_consistent(self) -> Self:
         if self.first > self.last:
             raise ValueError(f"expected first <= last, got {self.first} > {self.last}")
         if self.kind == "crc" and self.polynomial == 0:
@@ -113,11 +105,9 @@ class Message(Model):
         if self.sync is not None:
             spans.append((0, len(bytes.fromhex(self.sync)), "sync"))
         if self.check is not None:
-            spans.append((self.check.offset, self.check.width // 8, "check"))
-            if (
-                self.check.first <= self.check.offset + self.check.width // 8 - 1
-                and self.check.offset <= self.check.last
-            ):
+            size = self.check.width // 8
+            spans.append((self.check.offset, size, "check"))
+            if self.check.first < self.check.offset + size and self.check.offset <= self.check.last:
                 raise ValueError("expected a check outside of the bytes it covers, got one inside")
             if self.check.last >= self.length:
                 raise ValueError(
@@ -150,7 +140,7 @@ class CanLine(Model):
 
 
 class StatusBit(Model):
-    """A bit of the status word: its name for people and its meaning for the samples."""
+    """A bit of the status word: its name in messages and its effect on the samples."""
 
     bit: Annotated[int, Key(ge=0, le=31)]
     name: Annotated[str, Key(min_length=1, max_length=64)]
@@ -165,7 +155,7 @@ class Nominal(Model):
 
 
 class Profile(Model):
-    """A wire format, as its file has it; `layout` is the form that the decoder reads."""
+    """A wire format as in its file; `layout` is the form for the decoder."""
 
     format: Literal["imu50-profile"]
     version: Literal[1]
@@ -181,33 +171,36 @@ class Profile(Model):
 
     @field_validator("status_bits")
     @classmethod
-    def _bits_once(cls, bits: tuple[StatusBit, ...]) -> tuple[StatusBit, ...]:
+    def _no_duplicate_bits(cls, bits: tuple[StatusBit, ...]) -> tuple[StatusBit, ...]:
         if len({b.bit for b in bits}) < len(bits):
             raise ValueError("expected each bit once, got one twice")
         return bits
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
-        faults = list(self._transport_faults()) + list(self._field_faults())
+        faults = self._serial_faults() if self.transport == "serial" else self._can_faults()
+        faults += [*self._pulse_faults(), *self._counter_faults(), *self._status_and_temperature_faults()]
         if NS_PER_S % self.sample_rate_hz:
             faults.append("sample_rate_hz: expected a rate whose interval is whole nanoseconds")
         if faults:
             raise ValueError("; ".join(faults))
         return self
 
-    def _transport_faults(self) -> list[str]:
+    def _serial_faults(self) -> list[str]:
         faults = []
-        if self.transport == "serial":
-            if not isinstance(self.line, SerialLine):
-                faults.append("line: expected baudrate for a serial profile")
-            if len(self.messages) != 1:
-                faults.append(f"messages: expected one for a serial profile, got {len(self.messages)}")
-            for message in self.messages:
-                if message.sync is None:
-                    faults.append("messages[0].sync: expected the bytes that a frame begins with")
-                if message.id is not None or message.every != 1:
-                    faults.append("messages[0]: expected no 'id' and no 'every' in a serial profile")
-            return faults
+        if not isinstance(self.line, SerialLine):
+            faults.append("line: expected baudrate for a serial profile")
+        if len(self.messages) != 1:
+            faults.append(f"messages: expected one for a serial profile, got {len(self.messages)}")
+        for message in self.messages:
+            if message.sync is None:
+                faults.append("messages[0].sync: expected the bytes that a frame begins with")
+            if message.id is not None or message.every != 1:
+                faults.append("messages[0]: expected no 'id' and no 'every' in a serial profile")
+        return faults
+
+    def _can_faults(self) -> list[str]:
+        faults = []
         if not isinstance(self.line, CanLine):
             faults.append("line: expected bitrate for a CAN profile")
         longest = 64 if self.fd else 8
@@ -223,9 +216,6 @@ class Profile(Model):
         if len({m.id for m in self.messages}) < len(self.messages):
             faults.append("messages: expected each id once, got one twice")
         return faults
-
-    def _field_faults(self) -> list[str]:
-        return [*self._pulse_faults(), *self._counter_faults(), *self._status_and_temperature_faults()]
 
     def _pulse_faults(self) -> list[str]:
         faults = []
@@ -285,7 +275,7 @@ class Profile(Model):
         return round((slow + fast) * NS_PER_S)
 
     def layout(self) -> layout.Layout:
-        """The form that the decoder and the encoder read."""
+        """Return the form for the decoder and the encoder."""
         temperatures = [n for m in self.messages for n in m.fields if n.name == "temperature"]
         numbers = [n for m in self.messages for n in m.fields]
         names: list[str] = [n.sensor or "" for n in temperatures]

@@ -1,7 +1,9 @@
-"""Recordings: MCAP files with wire bytes, increments, status, and what made them.
+"""Recordings of the driver service: MCAP files with wire data, increments, status and events.
 
 format    channels and their encoding
-reader    read a recording, also one cut short
+reader    read a recording, also one that was cut
 pack      compress one
-export    convert to other formats: waypoint, ros2, tally for the loss summary
+export    convert to other formats
+waypoint  export to Waypoint and Inertial Explorer
+ros2      export to ROS 2
 """

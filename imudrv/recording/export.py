@@ -3,24 +3,18 @@
 ==========  =========================================================================================
 ``csv``     increments, one row a sample, the columns of `imudrv compensate`
 ``npz``     the same as numpy arrays
-``raw``     the bytes of a serial line as they came
+``raw``     the bytes of a serial line as received
 ``candump`` CAN messages as a log
 ``imr``     increments for Waypoint / Inertial Explorer
 ``ros2``    increments as rates, an MCAP of ``sensor_msgs/msg/Imu`` on ``/imu/data_raw`` (REP 145)
 ==========  =========================================================================================
 
-``imr`` follows NovAtel's description of the format
-(https://docs.novatel.com/Waypoint/Content/Data_Formats/IMR_File.htm): a header of 512 bytes, then 32 bytes a
-sample: seconds of the week as a double and six scaled i32, gyro X Y Z in degrees and accelerometer X Y Z in
-m/s, here increments. Time is UTC, which the header says, and begins anew with the week. What rounding takes
-from one increment the next one gets, so that sums are right to one unit.
-
-``imr`` and ``ros2`` have no flags: samples that are not valid go in like the others and are counted.
+``imr`` and ``ros2`` have no flags: samples that are not valid are written like the others and counted.
 """
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -29,10 +23,29 @@ from imudrv.files.outputs import require_other
 from imudrv.files.tables import increment_columns, table, writing
 from imudrv.recording.reader import Recording
 from imudrv.recording.ros2 import export_ros2
-from imudrv.recording.tally import Exported, Tally, require_transport
 from imudrv.recording.waypoint import export_imr
-from imudrv.records import INCREMENTS
+from imudrv.records import INCREMENTS, Flag, Records
 from imudrv.wire.candump import format_candump
+
+T = TypeVar("T")
+
+KINDS: Final = ("csv", "npz", "raw", "candump", "imr", "ros2")
+"""Names of the formats."""
+
+
+class Exported(NamedTuple):
+    """Counts of an export.
+
+    Parameters
+    ----------
+    written : int
+        Number of samples; for ``raw`` of bytes, for ``candump`` of messages.
+    invalid : int
+        Number of samples among them that are not valid.
+    """
+
+    written: int
+    invalid: int
 
 
 def export(recording: Recording, kind: str, target: Path) -> Exported:
@@ -41,11 +54,12 @@ def export(recording: Recording, kind: str, target: Path) -> Exported:
     Parameters
     ----------
     recording : Recording
-        Cut or whole.
+        Cut or complete.
     kind : str
         One of `KINDS`.
     target : Path
-        The file; it appears whole or not at all. For ``csv``, ``raw`` and ``candump`` also standard output.
+        The file; it appears complete or not at all. For ``csv``, ``raw`` and ``candump`` also standard
+        output.
 
     Returns
     -------
@@ -60,48 +74,65 @@ def export(recording: Recording, kind: str, target: Path) -> Exported:
     if kind not in KINDS:
         raise InputError(f"--to: expected one of {', '.join(KINDS)}, got {kind!r}")
     require_other(target, recording.path)
-    return KINDS[kind](recording, target)
+    if kind == "raw":
+        return Exported(_export_raw(recording, target), 0)
+    if kind == "candump":
+        return Exported(_export_candump(recording, target), 0)
+    samples = invalid = 0
+
+    def counted() -> Iterator[Records]:
+        nonlocal samples, invalid
+        for increments in recording.increments():
+            yield increments
+            samples += increments.size
+            invalid += int(np.count_nonzero(increments["flags"] & Flag.VALID == 0))
+
+    if kind == "imr":
+        export_imr(recording, counted(), target)
+    elif kind == "ros2":
+        export_ros2(recording, counted(), target)
+    else:
+        _export_table(f".{kind}", counted(), target)
+    return Exported(samples, invalid)
 
 
-def _export_table(suffix: str) -> Callable[[Recording, Path], Exported]:
-    def write(recording: Recording, target: Path) -> Exported:
-        tally = Tally()
-        with table(target, (suffix,), {}) as rows:
-            rows.write(increment_columns(np.zeros(0, INCREMENTS)))  # columns even without a sample
-            for increments in tally.of(recording.increments()):
-                rows.write(increment_columns(increments))
-        return tally.result
-
-    return write
+def _export_raw(recording: Recording, target: Path) -> int:
+    _require_transport(recording, "serial", "--to candump")
+    with writing(target) as file:
+        return sum(file.write(data) for data in _wire(recording, bytes))
 
 
-def _export_raw(recording: Recording, target: Path) -> Exported:
-    require_transport(recording, "serial", "--to candump")
+def _export_candump(recording: Recording, target: Path) -> int:
+    _require_transport(recording, "can", "--to raw")
     count = 0
     with writing(target) as file:
-        for arrival in recording.arrivals():
-            assert isinstance(arrival.data, bytes)
-            count += file.write(arrival.data)
-    return Exported(count, 0)
+        for messages in _wire(recording, np.ndarray):
+            file.write(format_candump(messages))
+            count += messages.size
+    return count
 
 
-def _export_candump(recording: Recording, target: Path) -> Exported:
-    require_transport(recording, "can", "--to raw")
-    count = 0
-    with writing(target) as file:
-        for arrival in recording.arrivals():
-            assert isinstance(arrival.data, np.ndarray)
-            file.write(format_candump(arrival.data))
-            count += arrival.data.size
-    return Exported(count, 0)
+def _require_transport(recording: Recording, transport: str, instead: str) -> None:
+    came = recording.profile.transport
+    if came != transport:
+        raise InputError(
+            f"{recording.path}: expected a recording of a {transport} unit, got {came}: {instead}"
+        )
 
 
-KINDS: Final[dict[str, Callable[[Recording, Path], Exported]]] = {
-    "csv": _export_table(".csv"),
-    "npz": _export_table(".npz"),
-    "raw": _export_raw,
-    "candump": _export_candump,
-    "imr": export_imr,
-    "ros2": export_ros2,
-}
-"""What there is, and what writes it."""
+def _wire(recording: Recording, kind: type[T]) -> Iterator[T]:
+    """Yield what was received, all of one kind."""
+    for arrival in recording.arrivals():
+        if not isinstance(arrival.data, kind):
+            raise InputError(
+                f"{recording.path}: expected wire data of its profile's transport, got those of another; "
+                "the file is damaged"
+            )
+        yield arrival.data
+
+
+def _export_table(suffix: str, pieces: Iterator[Records], target: Path) -> None:
+    with table(target, (suffix,), {}) as rows:
+        rows.write(increment_columns(np.zeros(0, INCREMENTS)))  # columns even without a sample
+        for increments in pieces:
+            rows.write(increment_columns(increments))

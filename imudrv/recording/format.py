@@ -1,4 +1,18 @@
-"""Channels of a recording and the encoding of their messages."""
+"""Channels of a recording, an MCAP file (https://mcap.dev/spec), and the encoding of their messages.
+
+=====================  ==========================================================================
+channel                a message
+=====================  ==========================================================================
+``/imu50/wire``        one read of the port at its host time: ``bytes`` as received, or
+                       ``can-messages`` (see `pack_messages`)
+``/imu50/increments``  ``i50n``: datagrams back to back
+``/imu50/status``      ``json``: status of the service
+``/imu50/events``      ``json``: ``{"text": ...}``, an event of the service
+=====================  ==========================================================================
+
+The attachments ``profile.yaml`` and ``calibration.yaml`` make a recording self-contained; a calibration that
+was exchanged later is attached again at its time. The metadata record ``imu50`` is the recording's origin.
+"""
 
 from collections.abc import Sequence
 from typing import Final
@@ -8,46 +22,30 @@ import numpy as np
 from imudrv.records import MESSAGE, Records
 
 WIRE: Final = "/imu50/wire"
-
-
 INCREMENTS: Final = "/imu50/increments"
-
-
 STATUS: Final = "/imu50/status"
-
-
 EVENTS: Final = "/imu50/events"
 
-
 BYTES: Final = "bytes"
-
-
 CAN_MESSAGES: Final = "can-messages"
-
-
 DATAGRAMS: Final = "i50n"
 
-
 PROFILE: Final = "profile.yaml"
-
-
 CALIBRATION: Final = "calibration.yaml"
-
-
 ORIGIN: Final = "imu50"
 """Name of the metadata record."""
 
 
 def pack_messages(pieces: Sequence[Records]) -> list[bytes]:
-    """CAN messages as a recording has them.
+    """Encode CAN messages for a recording.
 
     Each piece becomes a byte w, the longest data's length, and then for each message, little-endian: i64
-    time (ns), u32 identifier, u8 length, u8 CAN FD (1) or not (0), u8[w] data, zeros behind the length.
+    time (ns), u32 identifier, u8 length, u8 CAN FD (1) or not (0), u8[w] data, zeros after the length.
 
     Parameters
     ----------
     pieces : sequence of ndarray of MESSAGE
-        At least one; packed together since that is quicker.
+        At least one; encoded together because that is faster.
 
     Returns
     -------
@@ -68,7 +66,7 @@ def pack_messages(pieces: Sequence[Records]) -> list[bytes]:
 
 
 def unpack_messages(data: bytes) -> Records:
-    """CAN messages from a recording.
+    """Decode CAN messages of a recording.
 
     Parameters
     ----------
@@ -82,7 +80,7 @@ def unpack_messages(data: bytes) -> Records:
     Raises
     ------
     ValueError
-        It is something else.
+        The data are no such messages.
     """
     width = data[0] if data else 65
     if width > 64:

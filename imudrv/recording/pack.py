@@ -1,4 +1,4 @@
-"""Rewrite a recording compressed."""
+"""Compress a recording."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -11,14 +11,14 @@ from imudrv.recording.reader import Recording
 
 
 class Packed(NamedTuple):
-    """What `pack` did.
+    """Result of `pack`.
 
     Parameters
     ----------
     messages : int
-        How many there are.
+        Number of messages.
     cut : bool
-        The recording ended without its end, as after a power cut; what it had is in the packed one.
+        Whether the recording has no end, as after a power cut; the messages that it has were packed.
     """
 
     messages: int
@@ -33,7 +33,7 @@ def pack(source: Path, target: Path) -> Packed:
     source : Path
         The recording.
     target : Path
-        Its new file, the same one if wanted; it appears whole or not at all.
+        Its new file, which may be the same one; it appears complete or not at all.
 
     Returns
     -------
@@ -51,7 +51,7 @@ def pack(source: Path, target: Path) -> Packed:
     with atomic_write(target) as file:
         writer = Writer(file)
         writer.start()
-        for offset, record in recording._items():
+        for _, record in recording.records():
             if isinstance(record, Schema):
                 schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
             elif isinstance(record, Channel):
@@ -65,8 +65,6 @@ def pack(source: Path, target: Path) -> Packed:
             elif isinstance(record, Metadata):
                 writer.add_metadata(record.name, record.metadata)
             elif isinstance(record, Message):
-                if record.channel_id not in channels:
-                    raise recording._corrupt(offset, f"expected a known channel, got {record.channel_id}")
                 writer.add_message(
                     channels[record.channel_id],
                     record.log_time,

@@ -1,20 +1,7 @@
-"""Recordings: what the service saw and made of it, in an MCAP file (https://mcap.dev/spec).
-
-=====================  ==========================================================================
-channel                a message
-=====================  ==========================================================================
-``/imu50/wire``        one read of the port at its host time: ``bytes`` as they came, or
-                       ``can-messages`` (see `pack_messages`)
-``/imu50/increments``  ``i50n``: datagrams back to back
-``/imu50/status``      ``json``: how the service was
-``/imu50/events``      ``json``: ``{"text": ...}``, what happened
-=====================  ==========================================================================
-
-The attachments ``profile.yaml`` and ``calibration.yaml`` make a recording self-contained; a calibration that
-was swapped in later is attached again at its time. The metadata record ``imu50`` says where it all came from.
-"""
+"""Reader of recordings, also of those that were cut; see `imudrv.recording.format` for their contents."""
 
 import json
+import os
 import struct
 import zlib
 from collections.abc import Callable, Iterator
@@ -48,21 +35,13 @@ from imudrv.records import Arrival, Records
 from imudrv.wire.datagram import DatagramDecoder
 
 MAX_RECORD_BYTES: Final = 64 << 20
-"""Longest record that is read, and most that a chunk may unpack to."""
-
+"""Largest record, and largest unpacked chunk, bytes."""
 
 _RECORD: Final = struct.Struct("<BQ")
-
-
 _MESSAGE: Final = struct.Struct("<HIQQ")
-
-
 _FOOTER_BYTES: Final = _RECORD.size + 20
 
-
 _Record: TypeAlias = Schema | Channel | Message | Attachment | Metadata | Chunk
-
-
 _READ: Final[dict[int, Callable[[ReadDataStream], _Record]]] = {
     Opcode.SCHEMA: Schema.read,
     Opcode.CHANNEL: Channel.read,
@@ -70,36 +49,48 @@ _READ: Final[dict[int, Callable[[ReadDataStream], _Record]]] = {
     Opcode.METADATA: Metadata.read,
     Opcode.CHUNK: Chunk.read,
 }
-
-
 _LARGE: Final = frozenset({int(Opcode.MESSAGE), int(Opcode.CHUNK)})
 
 
-class _Item(NamedTuple):
-    """A record of the data section and where it stands."""
+class RecordAt(NamedTuple):
+    """A record of the data section and its offset in the file."""
 
     offset: int
     record: _Record
 
 
 class Recording:
-    """A recording, chunked or not, with its end or without; read as a stream, so that any length will do.
+    """A recording, chunked or not, of any length: it is read as a stream.
 
     A recording that was cut, at whatever byte, is read up to the cut.
 
     Parameters
     ----------
-    path : Path
+    path : path-like
         The file.
+
+    Attributes
+    ----------
+    path : Path
+    cut : bool
+        Whether the end is absent.
 
     Raises
     ------
     InputError
-        It cannot be read, or is no MCAP file.
+        The file cannot be read, or is no MCAP file.
+
+    Examples
+    --------
+    >>> recording = imudrv.Recording("run.mcap")
+    >>> recording
+    <Recording run.mcap, imu50-rs422, complete>
+    >>> np.concatenate(list(recording.increments()))["dtheta_b"].shape
+    (30, 3)
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = path = Path(path)
         try:
             with path.open("rb") as file:
                 head = file.read(len(MCAP0_MAGIC))
@@ -109,49 +100,56 @@ class Recording:
         if not MCAP0_MAGIC.startswith(head):
             raise InputError(f"{path}: expected a recording (MCAP), got another kind of file")
 
+    def __repr__(self) -> str:
+        try:
+            profile = self.profile.name
+        except InputError:
+            profile = "no profile"
+        return f"<Recording {self.path}, {profile}, {'cut' if self.cut else 'complete'}>"
+
     @property
     def profile_text(self) -> str:
-        """The profile of the unit that was recorded, as its file has it."""
+        """Text of the profile file."""
         found = next(self._attachments(PROFILE), None)
         if found is None:
-            why = "it was cut before it, there is nothing in it" if self.cut else "it is not one of ours"
+            why = "it was cut before it, there is nothing in it" if self.cut else "it is not from this driver"
             raise InputError(f"{self.path}: expected a recording with its {PROFILE}, got none: {why}")
         return found[1]
 
     @property
     def profile(self) -> Profile:
-        """The profile of the unit that was recorded."""
+        """Profile of the unit."""
         return settings_file.parse_text(self.profile_text.encode(), Profile, f"{self.path}: {PROFILE}")
 
     @property
     def calibration_text(self) -> str | None:
-        """The calibration that the recording began with, as its file has it; None without one."""
+        """Text of the first calibration file; None without one."""
         found = next(self._attachments(CALIBRATION), None)
         return None if found is None else found[1]
 
     @property
     def calibration(self) -> Calibration | None:
-        """The calibration that the recording began with."""
+        """First calibration; None without one."""
         text = self.calibration_text
         if text is None:
             return None
         return settings_file.parse_text(text.encode(), Calibration, f"{self.path}: {CALIBRATION}")
 
     def calibrations(self) -> Iterator[tuple[int, Calibration]]:
-        """All calibrations and since when they hold: for reads later than this host time, ns."""
+        """Yield each calibration with the host time, ns, after which it holds."""
         for t_ns, text in self._attachments(CALIBRATION):
             yield t_ns, settings_file.parse_text(text.encode(), Calibration, f"{self.path}: {CALIBRATION}")
 
     @property
     def origin(self) -> dict[str, str]:
-        """Where it came from: version, unit, port and so on; empty if it was cut before that."""
-        for item in self._items(skip_messages=True):
+        """Version of the driver, unit, port and so on; empty if the recording was cut before."""
+        for item in self.records(skip_messages=True):
             if isinstance(item.record, Metadata) and item.record.name == ORIGIN:
                 return item.record.metadata
         return {}
 
     def arrivals(self) -> Iterator[Arrival]:
-        """What the port brought, read by read."""
+        """Yield the reads of the port."""
         for offset, channel, message in self._messages(WIRE):
             if channel.message_encoding != CAN_MESSAGES:
                 yield Arrival(message.log_time, message.data)
@@ -163,7 +161,7 @@ class Recording:
             yield Arrival(message.log_time, messages)
 
     def increments(self) -> Iterator[Records]:
-        """Increments as they were published, ndarrays of INCREMENTS; counters modulo 2^32."""
+        """Yield the published increments, ndarrays of INCREMENTS; counters modulo 2^32."""
         for offset, _, message in self._messages(INCREMENTS):
             received = DatagramDecoder().feed(message.data)
             if received.rejects.size or not received.increments.size:
@@ -171,11 +169,11 @@ class Recording:
             yield received.increments
 
     def statuses(self) -> Iterator[tuple[int, dict[str, Any]]]:
-        """Host time, ns, and status."""
+        """Yield host time, ns, and status of the service."""
         yield from self._documents(STATUS)
 
     def events(self) -> Iterator[tuple[int, str]]:
-        """Host time, ns, and what happened."""
+        """Yield host time, ns, and text of each event."""
         for t_ns, document in self._documents(EVENTS):
             yield t_ns, str(document.get("text", ""))
 
@@ -190,7 +188,7 @@ class Recording:
             yield message.log_time, document
 
     def _attachments(self, name: str) -> Iterator[tuple[int, str]]:
-        for offset, record in self._items(skip_messages=True):
+        for offset, record in self.records(skip_messages=True):
             if isinstance(record, Attachment) and record.name == name:
                 try:
                     yield record.log_time, record.data.decode()
@@ -199,36 +197,50 @@ class Recording:
 
     def _messages(self, topic: str) -> Iterator[tuple[int, Channel, Message]]:
         channels: dict[int, Channel] = {}
-        for offset, record in self._items():
+        for offset, record in self.records():
             if isinstance(record, Channel):
                 channels[record.id] = record
             elif isinstance(record, Message):
-                channel = channels.get(record.channel_id)
-                if channel is None:
-                    raise self._corrupt(offset, f"expected a known channel, got {record.channel_id}")
+                channel = channels[record.channel_id]
                 if channel.topic == topic:
                     yield offset, channel, record
 
-    def _items(self, skip_messages: bool = False) -> Iterator[_Item]:
-        """Records of the data section, those in chunks instead of the chunks, up to its end or the cut."""
+    def records(self, skip_messages: bool = False) -> Iterator[RecordAt]:
+        """Yield the MCAP records up to the end or the cut; chunks are unpacked.
+
+        Parameters
+        ----------
+        skip_messages : bool
+            Leave messages and chunks out, which is faster.
+
+        Yields
+        ------
+        RecordAt
+
+        Raises
+        ------
+        InputError
+            The file is damaged or cannot be read.
+        """
         skipped = _LARGE if skip_messages else frozenset[int]()
+        channels: set[int] = set()
         try:
             with self.path.open("rb") as file:
                 file.seek(len(MCAP0_MAGIC))
-                for item in self._items_of(file, skipped):
+                for item in self._records_of(file, skipped, channels):
                     if not isinstance(item.record, Chunk):
                         yield item
                         continue
                     inside = BytesIO(self._unpacked(item.record, item.offset))
-                    for offset, record in self._items_of(inside, skipped):
+                    for offset, record in self._records_of(inside, skipped, channels):
                         if isinstance(record, Chunk):
                             raise self._corrupt(item.offset, "expected no chunk inside of a chunk")
-                        # Roughly: an offset inside means something in the unpacked chunk only.
-                        yield _Item(item.offset + offset, record)
+                        # Approximate: an offset inside refers to the unpacked chunk.
+                        yield RecordAt(item.offset + offset, record)
         except OSError as error:
             raise InputError(f"{self.path}: cannot be read on: {error.strerror or error}") from error
 
-    def _items_of(self, file: IO[bytes], skipped: frozenset[int]) -> Iterator[_Item]:
+    def _records_of(self, file: IO[bytes], skipped: frozenset[int], channels: set[int]) -> Iterator[RecordAt]:
         while True:
             offset = file.tell()
             head = file.read(_RECORD.size)
@@ -245,19 +257,24 @@ class Recording:
             body = file.read(length)
             if len(body) < length:
                 return
-            yield _Item(offset, self._parsed(opcode, body, offset))
+            record = self._parsed(opcode, body, offset)
+            if isinstance(record, Channel):
+                channels.add(record.id)
+            elif isinstance(record, Message) and record.channel_id not in channels:
+                raise self._corrupt(offset, f"expected a known channel, got {record.channel_id}")
+            yield RecordAt(offset, record)
 
     def _parsed(self, opcode: int, body: bytes, offset: int) -> _Record:
         try:
             if opcode == Opcode.MESSAGE:
-                # By hand: there are thousands a second of them.
+                # Not by the library: there are thousands a second.
                 channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(body)
                 return Message(channel, log_time, body[_MESSAGE.size :], publish_time, sequence)
             crc = int.from_bytes(body[-4:], "little") if opcode == Opcode.ATTACHMENT else 0
             if crc and crc != zlib.crc32(body[:-4]):
                 raise ValueError("its check is wrong")
             return _READ[opcode](ReadDataStream(BytesIO(body)))
-        except Exception as error:  # the library raises whatever its parts do
+        except Exception as error:  # the library raises many kinds
             kind = Opcode(opcode).name.lower()
             raise self._corrupt(offset, f"expected a whole {kind} record: {error}") from error
 
@@ -274,7 +291,7 @@ class Recording:
                 data = chunk.data
             else:
                 raise ValueError(f"unknown compression {chunk.compression!r}")
-        except Exception as error:  # each library has its own
+        except Exception as error:  # each library has its own kinds
             raise self._corrupt(offset, f"expected a chunk that unpacks: {error}") from error
         wrong = chunk.uncompressed_crc and chunk.uncompressed_crc != zlib.crc32(data)
         if len(data) != chunk.uncompressed_size or wrong:

@@ -1,5 +1,6 @@
 """Export to sensor_msgs/Imu in an MCAP file for ROS 2."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -9,11 +10,10 @@ from imudrv.errors import InputError
 from imudrv.files.atomic import atomic_write
 from imudrv.recording.format import ORIGIN
 from imudrv.recording.reader import Recording
-from imudrv.recording.tally import Exported, Tally
+from imudrv.records import Records
 from imudrv.units import NS, NS_PER_S
 
 TOPIC: Final = "/imu/data_raw"
-
 
 _IMU_DEFINITION: Final = """\
 std_msgs/Header header
@@ -45,20 +45,35 @@ float64 z
 """
 
 
-def export_ros2(recording: Recording, target: Path) -> Exported:
-    """Export as sensor_msgs/Imu for ROS 2."""
+def export_ros2(recording: Recording, pieces: Iterator[Records], target: Path) -> None:
+    """Write increments as rates and specific forces, one message a sample.
+
+    Parameters
+    ----------
+    recording : Recording
+        Source of the metadata.
+    pieces : iterator of ndarray of INCREMENTS
+        The increments, body axes.
+    target : Path
+        The file.
+
+    Raises
+    ------
+    InputError
+        The package mcap-ros2-support is absent, a sample has no interval or a time before 1970, or the file
+        cannot be written.
+    """
     try:
         from mcap_ros2.writer import Writer
     except ImportError as error:
         raise InputError(
             "--to ros2: expected the package mcap-ros2-support: pip install imu50[ros2]"
         ) from error
-    tally = Tally()
     with atomic_write(target) as file:
         writer = Writer(file)
         schema = writer.register_msgdef("sensor_msgs/msg/Imu", _IMU_DEFINITION)
         writer.add_metadata(ORIGIN, recording.origin)
-        for increments in tally.of(recording.increments()):
+        for increments in pieces:
             if (increments["interval_ns"] <= 0).any() or (increments["t_ns"] < 0).any():
                 raise InputError(
                     f"{recording.path}: expected samples with an interval and a time from 1970 on, got others"
@@ -69,7 +84,6 @@ def export_ros2(recording: Recording, target: Path) -> Exported:
             for t_ns, rate, force in zip(increments["t_ns"].tolist(), rates, forces, strict=True):
                 writer.write_message(TOPIC, schema, _imu_message(t_ns, rate, force), t_ns, t_ns)
         writer.finish()  # type: ignore[no-untyped-call]
-    return tally.result
 
 
 def _imu_message(t_ns: int, rate: list[float], force: list[float]) -> dict[str, Any]:

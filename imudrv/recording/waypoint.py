@@ -1,5 +1,12 @@
-"""Export to the IMR format of Waypoint and Inertial Explorer."""
+"""Export to the IMR format of Waypoint and Inertial Explorer.
 
+Format: https://docs.novatel.com/Waypoint/Content/Data_Formats/IMR_File.htm, a header of 512 bytes, then 32
+bytes a sample: seconds of the week as a double and six scaled i32, gyro X Y Z in degrees and accelerometer
+X Y Z in m/s, here increments. Time is UTC, which the header says, and restarts with the week. The rounding
+error of one increment is added to the next, so that sums are right to one unit.
+"""
+
+from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
 from typing import Final
@@ -10,7 +17,6 @@ from numpy.typing import NDArray
 from imudrv.errors import InputError
 from imudrv.files.atomic import atomic_write
 from imudrv.recording.reader import Recording
-from imudrv.recording.tally import Exported, Tally
 from imudrv.records import Records
 from imudrv.units import DEG, NS, NS_PER_S
 
@@ -38,26 +44,30 @@ _HEADER: Final = np.dtype(
         ("Reserved", "V354"),
     ]
 )
-
-
 _SAMPLE: Final = np.dtype([("time", "<f8"), ("gyro", "<i4", 3), ("accelerometer", "<i4", 3)])
-
-
 _GYRO_DEG: Final = 2.0**-25  # 5.2e-10 rad; an increment may be up to 64 deg
-
-
 _ACCELEROMETER_M_S: Final = 2.0**-24  # 6.0e-8 m/s; up to 128 m/s
-
-
 _WEEK_NS: Final = 7 * 86_400 * NS_PER_S
-
-
 _SUNDAY_NS: Final = 4 * 86_400 * NS_PER_S  # the epoch was a Thursday, weeks begin on Sunday
 
 
-def export_imr(recording: Recording, target: Path) -> Exported:
-    """Export as IMR."""
-    tally = Tally()
+def export_imr(recording: Recording, pieces: Iterator[Records], target: Path) -> None:
+    """Write increments as IMR.
+
+    Parameters
+    ----------
+    recording : Recording
+        Source of the header.
+    pieces : iterator of ndarray of INCREMENTS
+        The increments, body axes.
+    target : Path
+        The file.
+
+    Raises
+    ------
+    InputError
+        An increment that the format cannot hold, or the file cannot be written.
+    """
     unit = recording.origin.get("unit", "")
     header = np.zeros(1, _HEADER)
     header["szHeader"] = b"$IMURAW"
@@ -73,28 +83,27 @@ def export_imr(recording: Recording, target: Path) -> Exported:
     accelerometer = _Rounding("velocity", "m/s", _ACCELEROMETER_M_S)
     with atomic_write(target) as file:
         file.write(header.tobytes())
-        for increments in tally.of(recording.increments()):
+        for increments in pieces:
             samples = np.zeros(increments.size, _SAMPLE)
             samples["time"] = ((increments["t_ns"] + _SUNDAY_NS) % _WEEK_NS) * NS
             samples["gyro"] = gyro.feed(increments["dtheta_b"] / DEG, increments)
             samples["accelerometer"] = accelerometer.feed(increments["dv_b"], increments)
             file.write(samples.tobytes())
-    return tally.result
 
 
 class _Rounding:
-    """Increments to whole units; what is left over goes on to the next."""
+    """Rounding of increments to whole units; the remainder is added to the next increment."""
 
     def __init__(self, name: str, unit: str, scale: float) -> None:
         self._name = name
         self._unit = unit
         self._scale = scale
-        self._left = np.zeros(3)
+        self._remainder = np.zeros(3)
 
     def feed(self, values: NDArray[np.float64], increments: Records) -> NDArray[np.float64]:
-        sums = self._left + np.cumsum(values / self._scale, axis=0)
+        sums = self._remainder + np.cumsum(values / self._scale, axis=0)
         whole = np.rint(sums)
-        self._left = sums[-1] - whole[-1]
+        self._remainder = sums[-1] - whole[-1]
         units = np.diff(whole, axis=0, prepend=0)
         outside = ~(np.abs(units) < 2**31).all(axis=1)
         if outside.any():

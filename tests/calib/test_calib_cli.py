@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from samples import CERTIFICATE
 
 import calib
 from calib.cli.main import main
@@ -37,19 +38,7 @@ unit:
   noise: {{arw_deg_per_sqrt_h: 0.002, vrw_m_s_per_sqrt_h: 0.003}}
 """
 TRUTH_MM = {"x": [24.0, -11.0, -9.0], "y": [-23.0, 29.0, -7.0], "z": [-1.0, -18.0, 16.0]}
-UNIT = f"""
-format: imu50-calibration
-version: 1
-serial_number: "50-0017"
-created: 2026-11-22T10:00:00Z
-gyro:
-  scale_arcsec_per_pulse: [0.5, 0.5, 0.5]
-  bias_deg_per_h: [0.0, 0.0, 0.0]
-  C_bg: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
-accelerometer:
-  scale_pulse_per_m_s: [2000.0, 2000.0, 2000.0]
-  bias_ug: [0.0, 0.0, 0.0]
-  C_ba: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+UNIT = f"""{CERTIFICATE}\
 size_effect:
   r_mm: {TRUTH_MM}
   gauge: centroid
