@@ -22,7 +22,7 @@ from imudrv.arrays import Array
 from imudrv.calibration import Calibration, SensingPoints, SizeEffect
 from imudrv.errors import InputError
 from imudrv.nav.attitude import rotation
-from imudrv.sim.motion import start_attitude
+from imudrv.sim.path import start_attitude
 from imudrv.sim.scenario import (
     NOMINAL,
     Faults,

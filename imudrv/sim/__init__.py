@@ -1,9 +1,13 @@
-"""The unit that is not there: a motion, a unit with errors, and what its wire would carry.
+"""Simulator of a unit: motion, unit errors, wire encoding, line faults.
 
-    scenario   the YAML file: site, start, motion, unit, faults
-    motion     motion -> exact integrals over every sample interval
-    unit       integrals -> the unit's own errors -> pulses, with the truth beside them
-    faults     what a bad line does to frames and messages
+    scenario    YAML file: site, start, motion, unit, faults
+    path        path of the body in one segment of motion, quadrature nodes
+    integrate   path -> exact integrals over every sample interval
+    unit        integrals -> pulses with the errors of the unit, and the truth
+    faults      faults of the line on frames and messages
+    capture     pulses -> wire bytes or CAN messages, as a capture
+    live        the same in real time
+    links       the lines to play on: pty, serial port, TCP, CAN
 
-The truth is for tests and reports; nothing that estimates may see it.
+The truth is for tests and reports; no estimator may use it.
 """

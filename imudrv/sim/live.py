@@ -20,7 +20,8 @@ from imudrv.errors import InputError
 from imudrv.profiles.schema import Profile
 from imudrv.records import Records
 from imudrv.sim.capture import WireChunk, wire
-from imudrv.sim.links import open_link
+from imudrv.sim.links import open_line
+from imudrv.sim.links.base import LineOptions
 from imudrv.sim.scenario import Scenario, samples
 from imudrv.units import NS
 from imudrv.wire.layout import Layout
@@ -34,8 +35,8 @@ FINEST_NS: Final = 500_000
 _SLICE_NS: Final = 50_000_000
 
 
-class Due(NamedTuple):
-    """What goes out at a time.
+class DueChunk(NamedTuple):
+    """Data that are sent together.
 
     Parameters
     ----------
@@ -62,10 +63,10 @@ class PacedPlayback:
     """
 
     def __init__(self, scenario: Scenario, layout: Layout) -> None:
-        self._pieces = _ahead(wire(scenario, layout, AHEAD))
-        self._piece: WireChunk | None = None
+        self._chunks = _ahead(wire(scenario, layout, AHEAD))
+        self._chunk: WireChunk | None = None
         self._row = 0
-        self.due_ns()
+        self._current()
 
     def due_ns(self, group: int = 1) -> int | None:
         """When the next frames or messages are sent.
@@ -80,15 +81,10 @@ class PacedPlayback:
         int or None
             When the last of them is sent, from the beginning of the run; None after the end.
         """
-        while self._piece is None or self._row == self._piece.t_ns.size:
-            self._piece = next(self._pieces, None)
-            self._row = 0
-            if self._piece is None:
-                return None
-        t_ns = self._piece.t_ns
-        return int(t_ns[min(self._row + group, t_ns.size) - 1])
+        chunk = self._current()
+        return None if chunk is None else int(chunk.t_ns[min(self._row + group, chunk.t_ns.size) - 1])
 
-    def take(self, until_ns: int, most: int = MOST) -> Due | None:
+    def take(self, until_ns: int, most: int = MOST) -> DueChunk | None:
         """Take what is due.
 
         Parameters
@@ -100,22 +96,30 @@ class PacedPlayback:
 
         Returns
         -------
-        Due or None
+        DueChunk or None
             None when nothing is due.
         """
-        first_ns = self.due_ns()
-        if first_ns is None or first_ns > until_ns:
+        chunk = self._current()
+        if chunk is None or chunk.t_ns[self._row] > until_ns:
             return None
-        assert self._piece is not None
-        data, t_ns, end, _ = self._piece
+        data, t_ns, end, _ = chunk
         begin = self._row
         self._row += int(np.searchsorted(t_ns[begin : begin + most], until_ns, side="right"))
         start, stop = int(end[begin - 1]) if begin else 0, int(end[self._row - 1])
-        return Due(data[start:stop], first_ns, int(t_ns[self._row - 1]))
+        return DueChunk(data[start:stop], int(t_ns[begin]), int(t_ns[self._row - 1]))
 
     def close(self) -> None:
-        """Make no more."""
-        self._pieces.close()
+        """Stop the simulation."""
+        self._chunks.close()
+
+    def _current(self) -> WireChunk | None:
+        """Return the chunk of the next frame or message, None after the end."""
+        while self._chunk is None or self._row == self._chunk.t_ns.size:
+            self._chunk = next(self._chunks, None)
+            self._row = 0
+            if self._chunk is None:
+                return None
+        return self._chunk
 
 
 class Pace:
@@ -221,12 +225,13 @@ def play(
     """
     layout = profile.layout()
     stop = stop or threading.Event()
+    options = LineOptions(profile.name, speed is None, say, stop)
     latest_ns = last_ns = 0
     with (
         _signals_set(stop),
         closing(PacedPlayback(scenario, layout)) as unit,
         # the first samples are there before anybody hears of the line
-        closing(open_link(target, profile, speed is None, say, link, stop)) as line,
+        closing(open_line(target, profile, options, link)) as line,
     ):
         line.wait_for_reader()
         events = [
@@ -289,13 +294,13 @@ def speed_of(text: str) -> float | None:
     return speed
 
 
-def _ahead(pieces: Iterator[WireChunk]) -> Generator[WireChunk, None, None]:
-    """Make the next piece while this one is used."""
+def _ahead(chunks: Iterator[WireChunk]) -> Generator[WireChunk, None, None]:
+    """Make the next chunk while this one is used."""
     with ThreadPoolExecutor(1) as worker:
-        coming = worker.submit(next, pieces, None)
-        while (piece := coming.result()) is not None:
-            coming = worker.submit(next, pieces, None)
-            yield piece
+        coming = worker.submit(next, chunks, None)
+        while (chunk := coming.result()) is not None:
+            coming = worker.submit(next, chunks, None)
+            yield chunk
 
 
 @contextmanager

@@ -23,7 +23,8 @@ from imudrv.errors import InputError
 from imudrv.kernels import kernel
 from imudrv.nav.earth import earth_rate_n
 from imudrv.records import PULSES, Records
-from imudrv.sim.motion import Body, Dithering, Integrals, Motion, cycles_at, split_cycles
+from imudrv.sim.integrate import Body, Dithering, Integrals, Motion
+from imudrv.sim.path import cycles_at, split_cycles
 from imudrv.sim.scenario import NOMINAL, Dither, Faults, Scenario
 from imudrv.units import ARCSEC, DEG_PER_H, DEG_PER_SQRT_H, MM, NS, PPM, UG, URAD
 from imudrv.vectors import Vector, dot, row

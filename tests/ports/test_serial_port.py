@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import serial
 
 from imudrv import Source
 from imudrv.errors import InputError
@@ -203,11 +204,19 @@ def test_a_tcp_server_that_is_not_there_is_a_lost_port(server, rs422):
         open_port(url, rs422)
 
 
-def test_a_loop_is_read_through_pyserial(rs422, opened, arrivals):
+def test_a_loop_is_read_through_pyserial(rs422, opened, arrivals, monkeypatch):
+    devices = []
+    open_device = serial.serial_for_url
+
+    def remember(*arguments, **settings):
+        devices.append(open_device(*arguments, **settings))
+        return devices[0]
+
+    monkeypatch.setattr(serial, "serial_for_url", remember)
     port = opened("loop://?baudrate=115200", rs422)
     assert isinstance(port, PyserialPort)
     assert port.read(0).data == b""
-    port._device.write(MANY)
+    devices[0].write(MANY)
     assert b"".join(arrival.data for arrival in arrivals(port, len(MANY))) == MANY
     port.close()
     port.close()

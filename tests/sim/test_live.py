@@ -24,8 +24,8 @@ from imudrv import profiles
 from imudrv.errors import InputError
 from imudrv.files import settings_file
 from imudrv.records import Records
-from imudrv.sim import links
 from imudrv.sim.capture import wire
+from imudrv.sim.links import pty, tcp
 from imudrv.sim.live import MOST, Pace, PacedPlayback, Played, play, speed_of
 from imudrv.sim.scenario import Scenario
 
@@ -44,7 +44,7 @@ GENEROUS_S = 20.0
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     # the readers here throw nothing away when they open a port
-    monkeypatch.setattr(links, "SETTLE_S", 0.02)
+    monkeypatch.setattr(pty, "SETTLE_S", 0.02)
 
 
 @pytest.fixture
@@ -176,7 +176,7 @@ def test_in_real_time_the_unit_goes_on_without_a_reader_and_says_so(scenario: Ma
 def test_what_a_reader_leaves_at_the_end_is_not_delivered(
     scenario: Make, player: Player, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(links, "PATIENCE_S", 0.1)
+    monkeypatch.setattr(pty, "TIMEOUT_S", 0.1)
     run = scenario({"rest": {"duration_s": 0.01}})
     with opened(player.start(run, RS422, "pty", 10.0)):
         played = player.result()
@@ -185,7 +185,7 @@ def test_what_a_reader_leaves_at_the_end_is_not_delivered(
 
 def test_a_link_never_takes_the_place_of_a_file(run: Scenario, player: Player, tmp_path: Path) -> None:
     (tmp_path / "imu").write_text("precious")
-    with pytest.raises(InputError, match="expected a name that is free"):
+    with pytest.raises(InputError, match="expected an unused name"):
         player.start(run, RS422, "pty", None, link=tmp_path / "imu")
     with pytest.raises(InputError, match="cannot be made"):
         player.start(run, RS422, "pty", None, link=tmp_path / "no" / "imu")
@@ -277,14 +277,14 @@ def test_an_unplugged_tcp_server_closes_and_listens_again(scenario: Make, player
 def test_a_tcp_client_that_reads_nothing_is_cut_off_and_costs_the_others_nothing(
     scenario: Make, player: Player, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(links, "PATIENCE_S", 0.1)
+    monkeypatch.setattr(tcp, "TIMEOUT_S", 0.1)
     run = scenario({"rest": {"duration_s": 200.0}})
     where = player.start(run, RS422, "tcp://:0", 1000.0)
     with connect(where) as deaf, connect(where) as client:
         # 8.8 MB are more than the system keeps for a connection
         got = receive_to_the_end(client)
         assert whole(run, RS422).endswith(got)
-        assert player.said.get() == "a client takes nothing; 1 left"
+        assert player.said.get() == "a client reads nothing and was disconnected; 1 left"
         assert deaf.recv(1)
     assert player.result().undelivered > 0
 
@@ -297,7 +297,7 @@ def test_without_a_tcp_client_nothing_is_delivered(scenario: Make, player: Playe
     assert played.sent > 0
     assert played.undelivered > 0
     assert played.sent + played.undelivered == 44_000
-    assert player.said.get() == "a client has gone; 0 left"
+    assert player.said.get() == "a client disconnected; 0 left"
 
 
 def messages_of(run: Scenario, profile: profiles.Profile) -> list[tuple[int, bytes, bool]]:

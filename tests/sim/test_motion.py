@@ -10,7 +10,8 @@ from scipy.integrate import quad
 
 from imudrv.nav.attitude import rotation
 from imudrv.nav.earth import earth_rate_n
-from imudrv.sim.motion import Body, Dithering, Integrals, Motion, cycles_at, split_cycles, start_attitude
+from imudrv.sim.integrate import Body, Dithering, Integrals, Motion
+from imudrv.sim.path import cycles_at, split_cycles, start_attitude
 from imudrv.sim.scenario import Scenario, Start
 from imudrv.units import ARCSEC, DEG, NS, STANDARD_GRAVITY
 

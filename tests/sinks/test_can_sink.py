@@ -1,4 +1,5 @@
 import threading
+from pathlib import Path
 
 import can
 import numpy as np
@@ -62,11 +63,36 @@ def test_what_the_outgoing_profile_cannot_say_is_dropped_and_counted(batch, wait
         sink.close()
 
 
-def test_temperatures_go_by_what_they_measure() -> None:
-    have = ("gyro", "accelerometer", "electronics")
-    want = ("gyro", "accelerometer_x", "accelerometer_y", "accelerometer_z")
-    assert can_sink._related(have, want) == [[0], [1], [1], [1]]
-    assert can_sink._related(want, have) == [[0], [1, 2, 3], []]
+@pytest.mark.parametrize(
+    ("unit", "renamed", "expected"),
+    [
+        # one sensor for all accelerometers; the electronics have no place in the outgoing profile
+        ("imu50-rs422-acc", {}, [30.0, 34.0, 34.0, 34.0]),
+        # the mean of three; a sensor that the unit lacks goes out as zero counts
+        (
+            "imu50-rs422",
+            {"accelerometer_x": "accelerometer", "accelerometer_y": "electronics"},
+            [30.0, 36.0, 0.0, 38.0],
+        ),
+    ],
+)
+def test_temperatures_are_matched_by_sensor(
+    batch, wait_for, tmp_path: Path, unit: str, renamed: dict[str, str], expected: list[float]
+) -> None:
+    text = (Path(profiles.__file__).parent / "imu50-canfd.yaml").read_text()
+    for old, new in renamed.items():
+        text = text.replace(f"sensor: {old},", f"sensor: {new},")
+    profile = tmp_path / "outgoing.yaml"
+    profile.write_text(text)
+    with can.Bus(f"sensors {unit}", "virtual", protocol=protocol(fd=True)) as bus:
+        sink = CanSink(f"can://virtual/sensors {unit}?profile={profile}", profiles.load(unit).layout())
+        wait_for(lambda: sink.state.state == "ok")
+        sent = batch(1, 1)
+        sent.pulses["temperature_degc"][0, :4] = [30.0, 34.0, 36.0, 38.0]
+        sink.publish(sent)
+        degc = receive(bus, 1)["data"][0, 28:36].copy().view("<i2") * 0.01
+        assert degc == pytest.approx(expected, abs=1e-9)
+        sink.close()
 
 
 def test_a_driver_that_blocks_holds_nobody_and_costs_the_oldest_samples(batch, wait_for, monkeypatch) -> None:

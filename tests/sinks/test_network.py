@@ -1,5 +1,6 @@
 import socket
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 
 import numpy as np
@@ -22,10 +23,19 @@ def port_of(sink: TcpSink) -> int:
     return int(sink.state.state.rpartition(":")[2])
 
 
-def connect(sink: TcpSink, wait_for) -> socket.socket:
-    before = len(sink._clients)
-    client = socket.create_connection(("127.0.0.1", port_of(sink)), timeout=20)
-    wait_for(lambda: sink.poll() or len(sink._clients) > before)
+def clients_of(sink: TcpSink) -> int:
+    first = sink.state.state.split()[0]
+    return 0 if first == "waiting" else int(first)
+
+
+def connect(sink: TcpSink, wait_for, receive_buffer: int | None = None) -> socket.socket:
+    before = clients_of(sink)
+    client = socket.socket()
+    if receive_buffer is not None:
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer)
+    client.settimeout(20)
+    client.connect(("127.0.0.1", port_of(sink)))
+    wait_for(lambda: sink.poll() or clients_of(sink) > before)
     return client
 
 
@@ -89,27 +99,20 @@ def test_nothing_is_lost_from_the_moment_a_udp_receiver_is_there(batch) -> None:
     sink.close()
 
 
-def test_a_network_that_is_not_there_is_told_and_costs_samples_only(batch, monkeypatch) -> None:
-    sink = UdpSink("udp://127.0.0.1:9")
-    sink._is_connected = False
+def test_an_unreachable_network_is_reported_and_costs_samples_only(batch, wait_for, monkeypatch) -> None:
+    def unreachable(self: socket.socket, address: object) -> None:
+        raise OSError(101, "Network is unreachable")
 
-    class Away:
-        def connect(self, address: object) -> None:
-            raise OSError(101, "Network is unreachable")
-
-        def close(self) -> None:
-            pass
-
-    really, sink._socket = sink._socket, Away()
-    sink._retry_at = 0.0
-    sink.poll()
-    sink.publish(batch(0, 5))
-    assert sink.state[1:] == ("network is unreachable", False, 0, 5, 0)
-    sink._socket = really
-    sink._retry_at = 0.0
-    sink.poll()
-    assert sink.state.state == "ok"
-    sink.close()
+    with receiver() as udp:
+        with monkeypatch.context() as patch:
+            patch.setattr(socket.socket, "connect", unreachable)
+            sink = UdpSink(f"udp://127.0.0.1:{udp.getsockname()[1]}")
+            sink.publish(batch(0, 5))
+            assert sink.state[1:] == ("network is unreachable", False, 0, 5, 0)
+        wait_for(lambda: sink.poll() or sink.state.state == "ok")
+        sink.publish(batch(5, 1))
+        assert counters(udp.recv(65536)) == [5]
+        sink.close()
 
 
 @pytest.mark.parametrize(
@@ -128,7 +131,8 @@ def test_a_host_that_nobody_knows_is_refused() -> None:
 def test_tcp_serves_this_machine_only_unless_told_otherwise(tcp: TcpSink) -> None:
     assert tcp.state.state.startswith("waiting for a client on 127.0.0.1:")
     assert tcp.state.healthy
-    assert tcp._listener.getsockname()[0] == "127.0.0.1"
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.2", port_of(tcp)), timeout=20)
 
 
 def test_tcp_brings_every_client_every_sample_from_its_coming_on(tcp: TcpSink, batch, wait_for) -> None:
@@ -146,10 +150,9 @@ def test_tcp_brings_every_client_every_sample_from_its_coming_on(tcp: TcpSink, b
 def test_a_tcp_client_that_stops_reading_loses_its_own_oldest_samples_and_no_one_elses(
     tcp: TcpSink, batch, wait_for
 ) -> None:
-    samples = 60_000  # 4.6 MB: more than our queue and the system's buffers hold, the sender's being limited
+    samples = 100_000  # 7.6 MB: more than the queue of the sink and the buffers of the system hold
     got = bytearray()
-    with connect(tcp, wait_for) as stuck, connect(tcp, wait_for) as good:
-        tcp._clients[0].connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 16)
+    with connect(tcp, wait_for, receive_buffer=1 << 16) as stuck, connect(tcp, wait_for) as good:
         good.setblocking(False)
 
         def take() -> int:
@@ -186,7 +189,7 @@ def test_tcp_clients_come_and_go_and_talk_in_vain(tcp: TcpSink, batch, wait_for)
             tcp.poll()
             tcp.publish(batch(n, 1))
             assert counters(read(client, 1)) == [n]
-        wait_for(lambda: tcp.poll() or not tcp._clients)
+        wait_for(lambda: tcp.poll() or not clients_of(tcp))
     assert tcp.state.sent == 5
     assert tcp.state.state.startswith("waiting for a client")
 
@@ -195,7 +198,7 @@ def test_a_tcp_client_that_was_killed_is_found_out_by_writing(tcp: TcpSink, batc
     client = connect(tcp, wait_for)
     client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")  # close with a reset
     client.close()
-    wait_for(lambda: tcp.publish(batch(0, 1)) or not tcp._clients)
+    wait_for(lambda: tcp.publish(batch(0, 1)) or not clients_of(tcp))
 
 
 def test_more_tcp_clients_than_there_is_room_for_are_sent_away(tcp: TcpSink, wait_for) -> None:
@@ -208,14 +211,18 @@ def test_more_tcp_clients_than_there_is_room_for_are_sent_away(tcp: TcpSink, wai
         client.close()
 
 
-def test_closing_a_tcp_sink_sends_what_waits(batch, wait_for) -> None:
+def test_closing_a_tcp_sink_sends_what_is_queued(batch, wait_for) -> None:
     sink = TcpSink("tcp://127.0.0.1:0")
-    with connect(sink, wait_for) as client:
-        sink._clients[0].backlog._whole += batch(0, 3).datagrams
+    with connect(sink, wait_for, receive_buffer=1 << 16) as client, ThreadPoolExecutor() as pool:
+        put = 0
+        while sink.state.queued == 0:
+            sink.publish(batch(put, 100))
+            put += 100
+        data = pool.submit(read, client, put)
         sink.close()
-        assert counters(read(client, 3)) == [0, 1, 2]
+        assert counters(data.result(20)) == list(range(put))
         assert client.recv(1) == b""
-    assert sink.state[3:] == (3, 0, 0)
+    assert sink.state[3:] == (put, 0, 0)
 
 
 def test_a_port_that_is_taken_is_refused_before_the_start(tcp: TcpSink) -> None:

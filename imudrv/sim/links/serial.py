@@ -1,0 +1,67 @@
+"""Real serial port."""
+
+import time
+from contextlib import suppress
+
+import serial
+
+from imudrv.errors import InputError
+from imudrv.profiles.schema import SerialLine
+from imudrv.sim.links.base import RETRY_S, TIMEOUT_S, FileLine, LineOptions
+
+
+class SimulatedSerialPort(FileLine):
+    """Real serial port.
+
+    Parameters
+    ----------
+    options : LineOptions
+        Options of every line.
+    path : str
+        Path of the device.
+    line : SerialLine
+        Settings of the port.
+
+    Raises
+    ------
+    InputError
+        The port cannot be opened.
+    """
+
+    def __init__(self, options: LineOptions, path: str, line: SerialLine) -> None:
+        super().__init__(options)
+        self._path = path
+        self._line = line
+        self._port: serial.Serial | None = None
+        self.plug()
+        self._say(f"{options.name}, {line.baudrate} baud, plays on {path}")
+
+    def plug(self) -> None:
+        """Open the port."""
+        line = self._line
+        try:
+            self._port = serial.Serial(
+                self._path,
+                baudrate=line.baudrate,
+                bytesize=line.bytesize,
+                parity=line.parity[0].upper(),
+                stopbits=line.stopbits,
+                exclusive=True,
+            )
+        except (OSError, ValueError) as error:
+            raise InputError(f"{self._path}: cannot be opened as a serial port: {error}") from error
+        self._fd = self._port.fileno()
+
+    def finish(self) -> None:
+        """Wait until the driver has transmitted everything."""
+        deadline = time.monotonic() + TIMEOUT_S
+        with suppress(OSError):  # the device may have just disappeared
+            while self._port is not None and self._port.out_waiting and time.monotonic() < deadline:
+                time.sleep(RETRY_S)
+
+    def close(self) -> None:
+        """Close the port."""
+        if self._port is not None:
+            self._port.close()
+        self._port = None
+        self._fd = -1
