@@ -200,7 +200,7 @@ class SessionController:
                 events = () if batch is None else self._sampled(engine, batch)
                 is_due = time.monotonic() - shown_s >= SHOWN_S
                 if is_due and (shown := self._screen.shown) and (action := self._keys.action(shown)):
-                    events += engine.act(action)
+                    events += engine.handle(action)
                 last = self._happened(engine, events)
                 if events or is_due:
                     shown_s = time.monotonic()
@@ -253,7 +253,7 @@ class SessionController:
                 if self._is_new_to_unit:
                     self._is_new_to_unit = False
                     self._recognise(int(newest["counter"]))
-                events = engine.conditions(conditions)
+                events = engine.update_status(conditions)
         return events + engine.feed(batch.increments)
 
     def _recognise(self, counter: int) -> None:

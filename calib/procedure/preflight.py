@@ -13,14 +13,23 @@ from typing import Final
 import numpy as np
 
 from calib.axes import axis_name, side
+from calib.detection.tracking import MG, RestAverages
+from calib.procedure.events import Conditions
 from calib.procedure.prompts import turn_instruction
 from calib.procedure.schema import ProcedureLimits, Step
 from imudrv.arrays import Array
+from imudrv.calibration import Calibration
 from imudrv.nav.earth import EARTH_RATE, earth_rate_n
+from imudrv.records import Flag
+from imudrv.site import Site
 from imudrv.units import DEG, DEG_PER_H
 
 GRAVITY_TOLERANCE: Final = 0.02
 """Of the mean specific force, m/s^2: 2 mg, far above what a calibrated unit shows."""
+
+
+PREFLIGHT_S: Final = 30.0
+"""Length of the rest that is examined, s."""
 
 
 RATE_TOLERANCE: Final = 1.0 * DEG_PER_H
@@ -31,30 +40,27 @@ ANOTHER_POSE: Final = 30.0 * DEG
 """Gravity so far off its axis is not a lean any more, rad."""
 
 
-def axis_faults(
-    f_b: Array, omega_b: Array, step: Step, limits: ProcedureLimits, gravity: float, latitude_rad: float
-) -> tuple[str, ...]:
+def axis_faults(averages: RestAverages, step: Step, limits: ProcedureLimits, site: Site) -> tuple[str, ...]:
     """Why the mean readings at rest are not those of a sound unit in the pose of a step.
 
     Parameters
     ----------
-    f_b, omega_b : ndarray, shape (3,)
-        Means of specific force and rate over 30 s or more, m/s^2 and rad/s, body axes.
+    averages : RestAverages
+        Of 30 s or more.
     step : Step
         Its pose.
     limits : Limits
         Heading and tilt that it may have.
-    gravity : float
-        At the site, m/s^2.
-    latitude_rad : float
-        Of the site.
+    site : Site
+        Location of the unit.
 
     Returns
     -------
     tuple of str
         Each with what was read, what was expected, and what explains it; empty: all is well.
     """
-    pose = _Pose(step, limits, gravity, latitude_rad)
+    f_b, omega_b, gravity = averages.force, averages.rate, site.gravity
+    pose = _Pose(step, limits, gravity, site.latitude_rad)
     reasons = []
     size = float(np.linalg.norm(f_b))
     if abs(size - gravity) > GRAVITY_TOLERANCE:
@@ -76,6 +82,54 @@ def axis_faults(
         reasons.append(
             f"the {side(step.up)} side leans {lean / DEG:.1f} deg, want {limits.tilt_deg:g} at most"
         )
+    return tuple(reasons)
+
+
+def sensor_faults(
+    averages: RestAverages, status: Conditions, limits: ProcedureLimits, calibration: Calibration
+) -> tuple[str, ...]:
+    """Return what noise, status bits and temperatures at rest have against the unit.
+
+    Parameters
+    ----------
+    averages : RestAverages
+        Of 30 s or more.
+    status : Conditions
+        Reported by the unit.
+    limits : ProcedureLimits
+        Largest noise.
+    calibration : Calibration
+        Its temperature range.
+
+    Returns
+    -------
+    tuple of str
+        Empty if there is nothing.
+    """
+    reasons = []
+    if averages.flags & Flag.FAULT or status.faults:
+        reasons.append(f"the unit tells a fault: {', '.join(status.faults) or 'which, is not known'}")
+    if calibration.temperature is not None:
+        low, high = calibration.temperature.range_degc
+        holds = f"the certificate holds from {low:g} to {high:g}: wait until it is there"
+        outside = [
+            f"{name} at {t:.1f} degC, {holds}"
+            for name, t in status.temperature_degc.items()
+            if t is not None and not low <= t <= high
+        ]
+        if not outside and averages.flags & Flag.TEMPERATURE_RANGE:
+            outside = [f"a temperature is off, {holds}"]
+        reasons += outside
+    rate_noise, force_noise = averages.noise()
+    for what, noise, most, name in (
+        ("gyro", rate_noise / DEG, limits.noise_deg_per_s, "deg/s"),
+        ("accelerometer", force_noise / MG, limits.noise_mg, "mg"),
+    ):
+        if noise > most:
+            reasons.append(
+                f"{what} noise {noise:.3g} {name} rms at rest, want {most:g} at most: look for what "
+                "shakes the bench"
+            )
     return tuple(reasons)
 
 

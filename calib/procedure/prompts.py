@@ -2,16 +2,21 @@
 
 from dataclasses import dataclass
 from math import pi
-from typing import Final, TypeAlias
+from typing import Final, NamedTuple
 
 from calib.axes import axis_name, opposite, side, vector
 from calib.detection.tracking import AttitudeTracker, RotationTracker, StillnessDetector
+from calib.procedure.events import Accepted
 from calib.procedure.schema import ProcedureLimits, Step
 from imudrv.records import Flag
 from imudrv.units import DEG
 
-Says: TypeAlias = tuple[str, tuple[str, ...]]
-"""A headline of at most 38 characters, and hints."""
+
+class Prompt(NamedTuple):
+    """What the operator has to do: a headline of at most 38 characters, and hints."""
+
+    headline: str
+    hints: tuple[str, ...]
 
 
 READY_S: Final = 1.0
@@ -105,25 +110,23 @@ class StepObservation:
         return self.placed and self.still.quiet_s >= READY_S and not self.unfit
 
 
-def preflight(seen: StepObservation, failed: bool) -> Says:
+def preflight(seen: StepObservation, failed: bool) -> Prompt:
     """For the preflight; `failed`: the last check found something."""
     if seen.flags & Flag.WARM_UP:
-        return "WARMING UP, WAIT", ("the unit's warm-up bit is set",)
+        return Prompt("WARMING UP, WAIT", ("the unit's warm-up bit is set",))
     if seen.still.moving or not (seen.upright or failed):
-        return f"SET IT DOWN: {side(seen.step.up)} UP", (pose_text(seen.step), *_motion(seen))
+        return Prompt(f"SET IT DOWN: {side(seen.step.up)} UP", (pose_text(seen.step), *_motion(seen)))
     if failed:
-        return "CHECK FAILED: SEE WHY", (
-            pose_text(seen.step),
-            "it is checked again and again, and goes on when all is well",
-        )
-    return "HANDS OFF, CHECKING", (pose_text(seen.step),)
+        hint = "it is checked again and again, and goes on when all is well"
+        return Prompt("CHECK FAILED: SEE WHY", (pose_text(seen.step), hint))
+    return Prompt("HANDS OFF, CHECKING", (pose_text(seen.step),))
 
 
-def place(seen: StepObservation, hands_free: bool) -> Says:
+def place(seen: StepObservation, hands_free: bool) -> Prompt:
     """For placing the unit; `hands_free`: nobody is asked to confirm."""
     step = seen.step
     if not seen.upright:
-        return f"TURN IT: {side(step.up)} UP", (*_tip(seen), pose_text(step))
+        return Prompt(f"TURN IT: {side(step.up)} UP", (*_tip(seen), pose_text(step)))
     if not seen.placed:
         clockwise = seen.clockwise or 0.0
         word = "COUNTER-CLOCKWISE" if clockwise > 0.0 else "CLOCKWISE"
@@ -131,46 +134,79 @@ def place(seen: StepObservation, hands_free: bool) -> Says:
             f"{side(step.east)} points {abs(clockwise) / DEG:.0f} deg off east, want "
             f"{seen.limits.heading_deg:g} at most: turn it {turn_instruction(clockwise)}"
         )
-        return f"TURN IT {abs(clockwise) / DEG:.0f} DEG {word}", (hint, pose_text(step))
+        return Prompt(f"TURN IT {abs(clockwise) / DEG:.0f} DEG {word}", (hint, pose_text(step)))
     if seen.unfit:
-        return "WAIT FOR THE UNIT", (seen.unfit,)
+        return Prompt("WAIT FOR THE UNIT", (seen.unfit,))
     if seen.still.quiet_s < READY_S:
-        return "SET IT DOWN, HANDS OFF", (pose_text(step), *_motion(seen))
-    return "HANDS OFF" if hands_free else "READY: CONFIRM", (pose_text(step),)
+        return Prompt("SET IT DOWN, HANDS OFF", (pose_text(step), *_motion(seen)))
+    return Prompt("HANDS OFF" if hands_free else "READY: CONFIRM", (pose_text(step),))
 
 
-def settle(seen: StepObservation) -> Says:
+def settle(seen: StepObservation) -> Prompt:
     """For standing still before the alignment."""
     if seen.unfit:
-        return "WAIT FOR THE UNIT", (seen.unfit,)
-    return "HANDS OFF, SETTLING", _motion(seen)
+        return Prompt("WAIT FOR THE UNIT", (seen.unfit,))
+    return Prompt("HANDS OFF, SETTLING", _motion(seen))
 
 
-def rotate(seen: StepObservation, turn: RotationTracker) -> Says:
+def align() -> Prompt:
+    """For the alignment."""
+    return Prompt("HANDS OFF, ALIGNING", ("do not touch the unit or the bench",))
+
+
+def rest() -> Prompt:
+    """For the rest after the turn."""
+    return Prompt("HANDS OFF, RESTING", ("do not touch the unit or the bench",))
+
+
+def verdict(step: Step, number: int, steps: int, accepted: Accepted | None) -> Prompt:
+    """For the verdict on an attempt; None: it was rejected."""
+    if accepted is None:
+        return Prompt("REJECTED: DO IT AGAIN", (pose_text(step),))
+    turned = f"turned {accepted.angle_deg:+.1f} deg in {accepted.duration_s:.1f} s"
+    return Prompt(
+        f"GOOD: STEP {number} OF {steps} DONE", (f"{turned}, peak {accepted.peak_deg_per_s:.0f} deg/s",)
+    )
+
+
+def done(accepted: int, steps: int) -> Prompt:
+    """For the end."""
+    return Prompt("ALL STEPS DONE", (f"{accepted} accepted, {steps - accepted} skipped",))
+
+
+def aborted() -> Prompt:
+    """For the end after an abort."""
+    return Prompt("ABORTED", ())
+
+
+def rotate(seen: StepObservation, turn: RotationTracker) -> Prompt:
     """For the turn."""
     step, limits = seen.step, seen.limits
     whole = abs(step.turn_deg) * DEG
     how = "counter-clockwise" if step.turn_deg > 0 else "clockwise"
     plain = (f"{abs(step.turn_deg)} deg {how}, seen from above, in 2 to 3 s; then hands off",)
     if turn.begun is None:
-        return f"ROTATE NOW {step.turn_deg:+d}", plain
+        return Prompt(f"ROTATE NOW {step.turn_deg:+d}", plain)
     if turn.size > NAMED_RAD:
         if turn.axis_tilt > limits.axis_tilt_deg * DEG:
-            return "WRONG AXIS", (
+            hint = (
                 f"turns about {turn.about}, {turn.axis_tilt / DEG:.0f} deg off the vertical, want "
-                f"{limits.axis_tilt_deg:g} at most: keep {side(step.up)} up",
+                f"{limits.axis_tilt_deg:g} at most: keep {side(step.up)} up"
             )
+            return Prompt("WRONG AXIS", (hint,))
         if turn.angle * step.turn_deg < 0.0:
-            return "WRONG WAY", (wrong_direction_text(turn.angle, step),)
+            return Prompt("WRONG WAY", (wrong_direction_text(turn.angle, step),))
     done = abs(turn.angle)
     if done + abs(turn.rate) * _AHEAD_S >= whole:
-        return "STOP", (f"stop at {abs(step.turn_deg)} deg, hands off",)
+        return Prompt("STOP", (f"stop at {abs(step.turn_deg)} deg, hands off",))
     if done >= whole - limits.angle_tolerance_deg * DEG:
-        return "HOLD STILL", (f"turned {turn.angle / DEG:+.0f} deg",)
+        return Prompt("HOLD STILL", (f"turned {turn.angle / DEG:+.0f} deg",))
     # a smooth turn is nearly at its fastest from a quarter of the way on
     if 0.25 < done / whole < 0.7 and turn.peak < 0.9 * limits.least_peak_deg_per_s * DEG:
-        return "FASTER", (f"peak {turn.peak / DEG:.0f} deg/s, want {limits.least_peak_deg_per_s:g} at least",)
-    return f"ROTATE {step.turn_deg:+d}", plain
+        return Prompt(
+            "FASTER", (f"peak {turn.peak / DEG:.0f} deg/s, want {limits.least_peak_deg_per_s:g} at least",)
+        )
+    return Prompt(f"ROTATE {step.turn_deg:+d}", plain)
 
 
 def _tip(seen: StepObservation) -> tuple[str, ...]:

@@ -10,14 +10,14 @@ import pytest
 
 from calib.detection.acceptance import rejection_reasons
 from calib.detection.segments import find_segments
-from calib.procedure.engine import (
+from calib.procedure.engine import Engine
+from calib.procedure.events import (
     Abort,
     Aborted,
     Accepted,
     Checked,
     Conditions,
     Confirm,
-    Engine,
     Entered,
     Event,
     Finished,
@@ -78,7 +78,7 @@ class Driver:
         return self
 
     def act(self, action: Any) -> tuple[Event, ...]:
-        events = self.engine.act(action)
+        events = self.engine.handle(action)
         self.events += events
         return events
 
@@ -492,7 +492,7 @@ def test_a_fault_of_the_unit_is_named_and_it_waits_until_it_is_gone(drive: Drive
     turned["flags"][20_000:22_000] |= np.uint32(Flag.FAULT)
     driver = drive()
     driver.feed(turned[:19_000])
-    driver.engine.conditions(Conditions(("dither fault",), ("dither fault",), {}))
+    driver.engine.update_status(Conditions(("dither fault",), ("dither fault",), {}))
     driver.feed(turned[19_000:])
 
     restarted = driver.of(Restarted)[0]
@@ -676,7 +676,7 @@ def test_temperature_noise_and_faults_are_held_against_the_limits(drive: Drive, 
     rng = np.random.default_rng(1)
     turned["dv_b"] += 8e-5 * rng.standard_normal(turned["dv_b"].shape)
     driver = drive(calibration=calibration, limits={"noise_mg": 0.5})
-    driver.engine.conditions(
+    driver.engine.update_status(
         Conditions(("power", "warm-up"), ("power",), {"gyro": 48.25, "accelerometer_x": None})
     )
     driver.feed(part(turned, 0.0, CHECK_S))
