@@ -36,6 +36,7 @@ from calib.certificate import write
 from calib.lever_arms.gauge import convert
 from calib.procedure.engine import Engine
 from calib.procedure.events import Aborted, Accepted, Conditions, Entered, Event, Finished, Phase, Rejected
+from calib.procedure.messages import english
 from calib.procedure.plan import steps_left, verification
 from calib.procedure.schema import VERIFICATION, Procedure
 from calib.reports.identification import arms_text, report_html, verdict
@@ -143,7 +144,10 @@ class SessionController:
             if last.reasons:
                 raise InputError(
                     "\n  ".join(
-                        ["too few steps are accepted; resume for those that were skipped:", *last.reasons]
+                        [
+                            "too few steps are accepted; resume for those that were skipped:",
+                            *map(english, last.reasons),
+                        ]
                     )
                 )
             session.append(_entry(last))

@@ -16,6 +16,7 @@ the `NavigationLog` of the run.
 
 from collections.abc import Mapping
 
+from calib.axes import side
 from calib.detection.blocks import Block, BlockSplitter
 from calib.detection.tracking import MG, AttitudeTracker, StillnessDetector
 from calib.procedure.events import (
@@ -35,6 +36,7 @@ from calib.procedure.events import (
     Skipped,
     View,
 )
+from calib.procedure.messages import message, verbatim
 from calib.procedure.phases import STATES, motion_limits
 from calib.procedure.plan import predicted
 from calib.procedure.progress import Progress
@@ -152,7 +154,7 @@ class Engine:
             p = self._progress
             del p.accepted[step_id]
             p.index = self._index(step_id)
-            self._follow(p.reject((reason,)))
+            self._follow(p.reject(verbatim(reason)))
         return self._new_events()
 
     @property
@@ -167,7 +169,7 @@ class Engine:
             step=p.index + 1,
             steps=steps,
             step_id=step.id,
-            title=f"step {p.index + 1} of {steps}: {step.title}",
+            title=message("title", step=p.index + 1, steps=steps, side=side(step.up), turn_deg=step.turn_deg),
             headline=headline,
             hints=hints,
             reasons=p.reasons,
@@ -233,7 +235,7 @@ class Engine:
             try:
                 predicted(p.procedure, p.site, skipped=skipped)
             except InputError as error:
-                p.reasons = (str(error),)
+                p.reasons = (verbatim(str(error)),)
         p.bells += 1
         p.events.append(Finished(accepted, skipped, p.reasons, p.counter))
 

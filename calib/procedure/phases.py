@@ -14,9 +14,10 @@ from calib.estimation.runs import GUARD_S, Priors
 from calib.procedure import prompts
 from calib.procedure.attempt import Attempt
 from calib.procedure.events import PREFLIGHT, Accepted, Checked, Phase, Rejected
+from calib.procedure.messages import Message, message, verbatim
 from calib.procedure.preflight import PREFLIGHT_S, axis_faults, sensor_faults
 from calib.procedure.progress import Progress
-from calib.procedure.prompts import NAMED_RAD, READY_S, Prompt
+from calib.procedure.prompts import MIN_ROTATION_RAD, READY_S, Prompt
 from calib.procedure.transitions import Outcome
 from imudrv.errors import InputError
 from imudrv.nav.alignment import MIN_ALIGNMENT_S, Alignment
@@ -118,9 +119,7 @@ class Preflight(PhaseState):
         p.elapsed_s = averages.forget(*limits) * BLOCK_NS * NS
         if p.elapsed_s < PREFLIGHT_S - _HALF_BLOCK_S:
             rate, force = limits[0] / DEG, limits[1] / MG
-            p.reasons = (
-                f"it did not stand still, limits {rate:.2f} deg/s and {force:.1f} mg: looked at again",
-            )
+            p.reasons = (message("not_at_rest", rate_deg_per_s=rate, force_mg=force),)
             return None
         self._begin()
         p.reasons = sensor_faults(averages, p.status, p.procedure.limits, p.calibration)
@@ -227,28 +226,28 @@ class Aligning(PhaseState):
     def feed(self, block: Block) -> Outcome | None:
         """Align."""
         p, attempt = self.progress, self.progress.attempt
-        if why := p.disturbance(block):
-            return p.restart(f"{why} {p.elapsed_s:.0f} s into the alignment")
+        if cause := p.disturbance(block):
+            return p.restart(message("alignment_interrupted", elapsed_s=p.elapsed_s, cause=cause))
         attempt.append(block)
         self._averages.feed(block)
         if p.elapsed_s < min(self._next_s, self.duration_s - 0.5 * p.interval_s):
             return None
         self._next_s = max(p.elapsed_s + 10.0, 1.2 * p.elapsed_s)
         attempt.process()
-        faults: tuple[str, ...] = ()
+        faults: tuple[Message, ...] = ()
         if attempt.aligned is None:
             faults = axis_faults(self._averages, p.step, p.procedure.limits, p.site)
         try:
             aligned = self._alignment.result()
         except InputError as error:
-            return p.restart("; ".join((*faults, str(error))))
+            return p.restart(*faults, verbatim(str(error)))
         if self._alignment.done and aligned.motion:
-            faults = (*faults, aligned.motion)
+            faults = (*faults, verbatim(aligned.motion))
         attempt.aligned = aligned
         w, x, y, z = aligned.q_nb.tolist()
         p.attitude.q_nb = w, x, y, z
         if faults:
-            return p.restart("; ".join(faults))
+            return p.restart(*faults)
         if not self._alignment.done:
             return None
         attempt.heading_rad = p.observation.clockwise or 0.0
@@ -275,20 +274,20 @@ class Rotating(PhaseState):
         trouble = p.trouble(block)
         if rotation.begun is None:
             if trouble:
-                return p.restart(f"{trouble} before the turn")
+                return p.restart(message("before_rotation", cause=trouble))
             if not p.stillness.moving:
                 self._wait()
                 return None
         elif trouble:
-            return p.reject((f"{trouble} during the turn",))
+            return p.reject(message("during_rotation", cause=trouble))
         rotation.feed(block)
         if p.stillness.quiet_s < QUIET_S + _MARGIN_S:
             return None
-        if rotation.size < NAMED_RAD:
-            return p.restart(f"moved {rotation.size / DEG:.1f} deg before the turn: the rest is disturbed")
+        if rotation.size < MIN_ROTATION_RAD:
+            return p.restart(message("rest_disturbed", angle_deg=rotation.size / DEG))
         attempt.process()
         reasons = _rejections(p, attempt.rotation(), rest_after_s=0.0)
-        return p.reject(reasons) if reasons else Outcome.TURNED
+        return p.reject(*reasons) if reasons else Outcome.TURNED
 
     def _wait(self) -> None:
         """Keep the log short."""
@@ -321,8 +320,9 @@ class Resting(PhaseState):
         """Judge the rotation after the rest."""
         p, attempt = self.progress, self.progress.attempt
         attempt.append(block)
-        if why := p.disturbance(block):
-            return p.reject((f"{why} {p.elapsed_s:.1f} s into the rest, want {self.duration_s:g}",))
+        if cause := p.disturbance(block):
+            rest_s = self.duration_s
+            return p.reject(message("rest_interrupted", elapsed_s=p.elapsed_s, rest_s=rest_s, cause=cause))
         if p.stillness.quiet_s < self.duration_s + _MARGIN_S:
             return None
         attempt.process()
@@ -330,7 +330,7 @@ class Resting(PhaseState):
         reasons = _rejections(p, rotation, self.duration_s)
         accepted = None if reasons or rotation is None else self._accepted(rotation)
         if accepted is None:
-            return p.reject(reasons)
+            return p.reject(*reasons)
         p.accepted[p.step.id] = accepted
         p.events.append(accepted)
         p.bells += 1
@@ -422,13 +422,13 @@ def motion_limits(rate_noise: float, force_noise: float) -> tuple[float, float]:
     return 2.0 * EARTH_RATE + SIGMAS * rate_noise, LEAST_FORCE + SIGMAS * force_noise
 
 
-def _rejections(progress: Progress, rotation: Rotation | None, rest_after_s: float) -> tuple[str, ...]:
+def _rejections(progress: Progress, rotation: Rotation | None, rest_after_s: float) -> tuple[Message, ...]:
     """Return why a rotation cannot be used."""
     step = progress.step
     if rotation is None:
-        return ("the turn is not to be told from the rest",)
+        return (message("no_rotation"),)
     limits = replace(progress.procedure.rotation_limits(step), rest_after_s=rest_after_s)
-    reasons = rejection_reasons(rotation, limits, step.up[1])
-    if rotation.angle_deg * np.sign(step.turn_deg) < -NAMED_RAD / DEG:
-        return (prompts.wrong_direction_text(rotation.angle_deg * DEG, step), *reasons)
+    reasons = tuple(map(verbatim, rejection_reasons(rotation, limits, step.up[1])))
+    if rotation.angle_deg * np.sign(step.turn_deg) < -MIN_ROTATION_RAD / DEG:
+        return (prompts.wrong_direction(rotation.angle_deg, step), *reasons)
     return reasons

@@ -6,6 +6,7 @@ from calib.detection.blocks import Block
 from calib.detection.tracking import AttitudeTracker, StillnessDetector
 from calib.procedure.attempt import Attempt
 from calib.procedure.events import Accepted, Conditions, Event, NavigationLog, Rejected, Restarted
+from calib.procedure.messages import Message, message
 from calib.procedure.prompts import StepObservation
 from calib.procedure.schema import Procedure, Step
 from calib.procedure.transitions import Outcome
@@ -39,7 +40,7 @@ class Progress:
         Logs of the accepted runs.
     events : list of Event
         Events that were not handed out yet.
-    reasons : tuple of str
+    reasons : tuple of Message
         Latest reasons of a rejection or a restart.
     bells : int
         See `View`.
@@ -65,7 +66,7 @@ class Progress:
     skipped: set[str] = field(default_factory=set)
     logs: list[NavigationLog] = field(default_factory=list)
     events: list[Event] = field(default_factory=list)
-    reasons: tuple[str, ...] = ()
+    reasons: tuple[Message, ...] = ()
     bells: int = 0
     status: Conditions = field(default_factory=Conditions)
     flags: int = 0
@@ -102,15 +103,15 @@ class Progress:
         self.index = index
         return Outcome.NEXT_STEP
 
-    def trouble(self, block: Block) -> str:
-        """Return why the samples of a block cannot be used, empty if they can."""
+    def trouble(self, block: Block) -> Message | None:
+        """Return why the samples of a block cannot be used."""
         if block.restarted:
-            return "the unit restarted"
-        return f"{block.missing} samples missing" if block.hole else self.observation.unfit
+            return message("unit_restarted")
+        return message("samples_missing", missing=block.missing) if block.hole else self.observation.unfit
 
-    def disturbance(self, block: Block) -> str:
-        """Return why a block is not one of a rest, empty if it is."""
-        moved = f"it moved ({self.stillness.why})" if self.stillness.moving else ""
+    def disturbance(self, block: Block) -> Message | None:
+        """Return why a block is not one of a rest."""
+        moved = message("moved", motion=self.stillness.why) if self.stillness.moving else None
         return self.trouble(block) or moved
 
     def navigate(self, q_nb: Quaternion) -> None:
@@ -118,14 +119,14 @@ class Progress:
         navigator = Navigator.from_site(self.site, q_nb, C_ba=self.calibration.accelerometer.C_ba_array)
         self.attempt.navigate(navigator, turn(conjugate(q_nb), (0.0, 0.0, 1.0)))
 
-    def restart(self, reason: str) -> Outcome:
+    def restart(self, *reasons: Message) -> Outcome:
         """Report that the alignment has to start again."""
-        self.events.append(Restarted(self.step.id, self.number, reason, self.counter))
+        self.events.append(Restarted(self.step.id, self.number, reasons, self.counter))
         self.bells += 1
-        self.reasons = (reason,)
+        self.reasons = reasons
         return Outcome.DISTURBED
 
-    def reject(self, reasons: tuple[str, ...]) -> Outcome:
+    def reject(self, *reasons: Message) -> Outcome:
         """Report that the attempt is rejected, and drop its evidence."""
         self.events.append(Rejected(self.step.id, self.number, reasons, self.counter))
         self.bells += 1
