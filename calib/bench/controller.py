@@ -36,6 +36,7 @@ from calib.certificate import write
 from calib.lever_arms.gauge import convert
 from calib.procedure.engine import Engine
 from calib.procedure.events import Aborted, Accepted, Conditions, Entered, Event, Finished, Phase, Rejected
+from calib.procedure.messages import english
 from calib.procedure.plan import steps_left, verification
 from calib.procedure.schema import VERIFICATION, Procedure
 from calib.reports.identification import arms_text, report_html, verdict
@@ -143,7 +144,10 @@ class SessionController:
             if last.reasons:
                 raise InputError(
                     "\n  ".join(
-                        ["too few steps are accepted; resume for those that were skipped:", *last.reasons]
+                        [
+                            "too few steps are accepted; resume for those that were skipped:",
+                            *map(english, last.reasons),
+                        ]
                     )
                 )
             session.append(_entry(last))
@@ -200,7 +204,7 @@ class SessionController:
                 events = () if batch is None else self._sampled(engine, batch)
                 is_due = time.monotonic() - shown_s >= SHOWN_S
                 if is_due and (shown := self._screen.shown) and (action := self._keys.action(shown)):
-                    events += engine.act(action)
+                    events += engine.handle(action)
                 last = self._happened(engine, events)
                 if events or is_due:
                     shown_s = time.monotonic()
@@ -253,7 +257,7 @@ class SessionController:
                 if self._is_new_to_unit:
                     self._is_new_to_unit = False
                     self._recognise(int(newest["counter"]))
-                events = engine.conditions(conditions)
+                events = engine.update_status(conditions)
         return events + engine.feed(batch.increments)
 
     def _recognise(self, counter: int) -> None:

@@ -17,13 +17,14 @@ from rich.text import Text
 
 from calib.bench import block_letters
 from calib.procedure.events import Phase, View
+from calib.procedure.messages import english, message, verbatim
 from imudrv.diagnosis import LineState
 
-UNHEARD: Final = "NO DATA: CHECK THE CABLE"
+UNHEARD: Final = message("no_data")
 """Headline while nothing comes from the unit."""
 
 
-UNREADABLE: Final = "NO FRAMES: CHECK THE PROFILE"
+UNREADABLE: Final = message("no_frames")
 """Headline while what comes is not what the profile says."""
 
 
@@ -76,7 +77,7 @@ def with_port_state(view: View, state: LineState) -> View:
         return view
     headlines = {"streaming": view.headline, "unreadable": UNREADABLE}
     headline = headlines.get(state.name, UNHEARD)
-    return replace(view, headline=headline, reasons=(str(state), *view.reasons))
+    return replace(view, headline=headline, reasons=(verbatim(str(state)), *view.reasons))
 
 
 def screen(
@@ -103,9 +104,9 @@ def screen(
     top.add_column(no_wrap=True, overflow="ellipsis")
     top.add_column(justify="right", no_wrap=True)
     where = f"{view.phase.value.upper()} {_time(view.remaining_s)}"
-    top.add_row(Text(view.title, "bold"), Text(where, "bold"))
-    hints = _wrapped(view.hints, width, _FEWEST, _MOST_HINTS)
-    reasons = _wrapped(view.reasons, width, _FEWEST, _MOST_REASONS)
+    top.add_row(Text(english(view.title), "bold"), Text(where, "bold"))
+    hints = _wrapped([english(hint) for hint in view.hints], width, _FEWEST, _MOST_HINTS)
+    reasons = _wrapped([english(reason) for reason in view.reasons], width, _FEWEST, _MOST_REASONS)
     free = height - _OTHER_ROWS - len(hints) - len(reasons)
     return Group(
         top,
@@ -119,8 +120,8 @@ def screen(
 
 def plain(view: View, question: str = "") -> str:
     """A view in a line; what changes all the time is left out."""
-    parts = [view.title, f"{view.phase.value}: {view.headline}", *view.hints]
-    parts += [f"! {reason}" for reason in (*view.reasons, question) if reason]
+    parts = [english(view.title), f"{view.phase.value}: {english(view.headline)}", *map(english, view.hints)]
+    parts += [f"! {reason}" for reason in (*map(english, view.reasons), question) if reason]
     return " | ".join(part for part in parts if part)
 
 
@@ -235,15 +236,15 @@ def _time(seconds: float | None) -> str:
 def _banner(view: View, width: int, height: int, ascii_only: bool) -> RenderableType:
     refused = view.reasons and view.phase in (Phase.PREFLIGHT, Phase.PLACE, Phase.VERDICT)
     style = "white on red" if refused or view.headline in (UNHEARD, UNREADABLE) else _STYLES[view.phase]
-    inside = width - 2
-    scale, lines = block_letters.fitted(view.headline, inside, height)
+    headline, inside = english(view.headline), width - 2
+    scale, lines = block_letters.fitted(headline, inside, height)
     if ascii_only and scale < 2:
         scale = 0
     if scale:
         drawn = [block_letters.blocks(line, scale, ascii_only) for line in lines]
         rows = drawn[0] + [row for block in drawn[1:] for row in ["", *block]]
     else:
-        rows = [view.headline]
+        rows = [headline]
     free = height - len(rows)
     rows = ["" for _ in range(free // 2)] + rows + ["" for _ in range(free - free // 2)]
     text = "\n".join(row.center(width)[:width] for row in rows)

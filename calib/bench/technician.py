@@ -14,8 +14,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation as Attitude
 
 from calib.axes import side
-from calib.procedure.engine import PREFLIGHT_S
 from calib.procedure.plan import TURN_S
+from calib.procedure.preflight import PREFLIGHT_S
 from calib.procedure.prompts import READY_S
 from calib.procedure.schema import Procedure, Step
 from imudrv.arrays import Array

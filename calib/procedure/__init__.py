@@ -1,10 +1,13 @@
 """The bench procedure, without screen, files or clock.
 
-schema     procedure file
-plan       shipped procedures, predicted accuracy, remaining steps
-engine     state machine: samples and keys in, events and a view out
-attempt    one attempt at a step
-events     events and views of the engine
-preflight  check of the sensors before the first step
-prompts    text for the operator
+schema       procedure file
+plan         shipped procedures, predicted accuracy, remaining steps
+engine       state machine: samples and keys in, events and a view out
+transitions  its table
+phases       what happens in each phase
+progress     state that the phases share
+attempt      evidence of one attempt at a step
+events       actions, events and views
+preflight    check of the sensors before the first step
+prompts      what the operator has to do
 """

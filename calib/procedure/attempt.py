@@ -7,80 +7,92 @@ from numpy.typing import NDArray
 
 from calib.detection.blocks import Block
 from calib.detection.segments import Rotation, Segmenter
-from calib.detection.tracking import RestAverages, RotationTracker
+from calib.detection.tracking import RotationTracker
 from calib.procedure.events import NavigationLog
 from imudrv.arrays import Array
-from imudrv.nav.alignment import MIN_ALIGNMENT_S, Aligned, Alignment
+from imudrv.nav.alignment import Aligned, Alignment
 from imudrv.nav.mechanisation import Navigator
 from imudrv.records import Records
 from imudrv.vectors import Vector
 
-_BLOCKS_A_FLUSH: Final = 500
+_BLOCKS_PER_PASS: Final = 500
 
 
 class Attempt:
-    """The evidence of one attempt, from when the unit stands still."""
+    """Evidence of one attempt, from the first sample at rest.
+
+    Attributes
+    ----------
+    aligned : Aligned or None
+        Latest result of the alignment.
+    heading_rad : float
+        Clockwise deviation of the pose from its heading, at the end of the alignment.
+    turn : RotationTracker
+        Rotation since the start of navigation.
+    samples : int
+        Number of samples so far.
+    """
 
     def __init__(self) -> None:
-        self.alignment: Alignment | None = None
         self.aligned: Aligned | None = None
-        self.heading = 0.0  # how far it stood turned clockwise, rad
-        self.means = RestAverages()
-        self.look_s = MIN_ALIGNMENT_S  # when the alignment is looked at next
+        self.heading_rad = 0.0
         self.turn = RotationTracker()
-        self._held: list[Records] = []
-        self._behind: Records | None = None  # samples behind the alignment's window
+        self.samples = 0
+        self._first = self._last = -1  # counters
+        self._waiting: list[Records] = []
         self._segmenter = Segmenter()
+        self._alignment: Alignment | None = None
+        self._after_alignment: Records | None = None
         self._navigator: Navigator | None = None
-        self.samples = 0  # since the first one held
-        self._first: int | None = None
-        self._last = 0
         self._navigated: list[tuple[NDArray[np.int64], Array, Array]] = []
 
-    def hold(self, block: Block) -> None:
+    def append(self, block: Block) -> None:
         """Append a block."""
-        if self._first is None:
+        if not self.samples:
             self._first = int(block.rows["counter"][0])
         self._last = block.last
         self.samples += len(block.rows)
-        self._held.append(block.rows)
-        if len(self._held) >= _BLOCKS_A_FLUSH:
-            self.flush()
+        self._waiting.append(block.rows)
+        if len(self._waiting) >= _BLOCKS_PER_PASS:
+            self.process()
 
-    def flush(self) -> None:
-        """Take what is held through segments, alignment and navigation."""
-        if not self._held:
+    def process(self) -> None:
+        """Segment, align or navigate the blocks that were appended."""
+        if not self._waiting:
             return
-        rows = np.concatenate(self._held)
-        self._held.clear()
+        rows = np.concatenate(self._waiting)
+        self._waiting.clear()
         self._segmenter.feed(rows)
         if self._navigator is not None:
-            self._navigate(rows)
-        elif self.alignment is not None:
-            self._behind = self.alignment.feed(rows)
+            self._navigate(self._navigator, rows)
+        elif self._alignment is not None:
+            self._after_alignment = self._alignment.feed(rows)
+
+    def align(self, alignment: Alignment) -> None:
+        """Start an alignment with the next block."""
+        self.process()
+        self._alignment = alignment
 
     def navigate(self, navigator: Navigator, up_b: Vector) -> None:
-        """Begin the log."""
+        """Start the log anew at the end of the alignment, or at the next block; `up_b` is the vertical."""
         self._navigator, self.turn = navigator, RotationTracker(up_b)
         self._navigated.clear()
-        if self._behind is not None:
-            self._navigate(self._behind)
-            self._behind = None
+        if self._after_alignment is not None:
+            self._navigate(navigator, self._after_alignment)
+            self._after_alignment = None
 
-    def _navigate(self, rows: Records) -> None:
-        assert self._navigator is not None
-        told = self._navigator.feed(rows)
-        self._navigated.append((told["counter"].copy(), told["v_n"].copy(), told["H"].copy()))
+    def _navigate(self, navigator: Navigator, rows: Records) -> None:
+        result = navigator.feed(rows)
+        self._navigated.append((result["counter"].copy(), result["v_n"].copy(), result["H"].copy()))
 
     def rotation(self) -> Rotation | None:
-        """The turn, as the segments have it."""
+        """Return the rotation that was detected in the blocks processed so far."""
         begun = self.turn.begun
-        assert begun is not None
-        return next((r for r in self._segmenter.result().rotations if r.stop > begun), None)
+        rotations = self._segmenter.result().rotations
+        return next((r for r in rotations if begun is not None and r.stop > begun), None)
 
     def log(self, step_id: str, number: int, interval_s: float) -> NavigationLog:
         """Return velocity and H of all navigated samples."""
-        assert self._first is not None
         counter, v_n, H = (np.concatenate(parts) for parts in zip(*self._navigated, strict=True))
         t_s = (counter + 1 - counter[0]) * interval_s
         return NavigationLog(step_id, number, self._first, self._last, counter, t_s, v_n, H)

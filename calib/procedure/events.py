@@ -11,6 +11,7 @@ from typing import Final, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.procedure.messages import Message
 from imudrv.arrays import Array
 
 PREFLIGHT: Final = "preflight"
@@ -112,11 +113,11 @@ class Checked:
 
 @dataclass(frozen=True)
 class Restarted:
-    """The alignment of an attempt begins again, because of `reason`."""
+    """The alignment of an attempt begins again."""
 
     step_id: str
     attempt: int
-    reason: str
+    reasons: tuple[Message, ...]
     counter: int
 
 
@@ -169,7 +170,7 @@ class Rejected:
 
     step_id: str
     attempt: int
-    reasons: tuple[str, ...]
+    reasons: tuple[Message, ...]
     counter: int
 
 
@@ -205,7 +206,7 @@ class Finished:
 
     accepted: tuple[str, ...]
     skipped: tuple[str, ...]
-    reasons: tuple[str, ...]
+    reasons: tuple[Message, ...]
     counter: int
 
 
@@ -291,10 +292,10 @@ class View:
     step: int
     steps: int
     step_id: str
-    title: str
-    headline: str
-    hints: tuple[str, ...]
-    reasons: tuple[str, ...]
+    title: Message
+    headline: Message
+    hints: tuple[Message, ...]
+    reasons: tuple[Message, ...]
     angle_deg: float | None
     want_deg: float | None
     rate_deg_per_s: float

@@ -1,11 +1,12 @@
-"""What a unit at rest shows of itself: gravity and the Earth's rotation, their size, sign and axes.
+"""Check of a unit at rest: noise, temperatures, gravity and the Earth's rotation, their size, sign and axes.
 
 The pose is known, so both vectors are. Where the readings differ, each single cause is tried, another pose,
-one axis reversed, two exchanged; those that explain both readings are named. Readings that several explain
-are said not to be told apart: near the equator the Earth's rotation has no vertical part, and in one pose a
-reversed level gyro looks like a unit that stands the other way round.
+one axis reversed, two exchanged; those that explain both readings are named. Causes that explain them equally
+well are reported as ambiguous: near the equator the Earth's rotation has no vertical part, and in one pose a
+reversed level gyro looks like a unit with the opposite heading.
 """
 
+from functools import reduce
 from itertools import combinations
 from math import acos, atan2, sin
 from typing import Final
@@ -13,74 +14,129 @@ from typing import Final
 import numpy as np
 
 from calib.axes import axis_name, side
-from calib.procedure.prompts import turn_instruction
+from calib.detection.tracking import MG, RestAverages
+from calib.procedure.events import Conditions
+from calib.procedure.messages import Message, message
+from calib.procedure.prompts import fault_message, lean_message, turn_message
 from calib.procedure.schema import ProcedureLimits, Step
 from imudrv.arrays import Array
+from imudrv.calibration import Calibration
 from imudrv.nav.earth import EARTH_RATE, earth_rate_n
+from imudrv.records import Flag
+from imudrv.site import Site
 from imudrv.units import DEG, DEG_PER_H
 
+PREFLIGHT_S: Final = 30.0
+"""Length of the rest that is examined, s."""
+
+
 GRAVITY_TOLERANCE: Final = 0.02
-"""Of the mean specific force, m/s^2: 2 mg, far above what a calibrated unit shows."""
+"""Tolerance of the mean specific force, m/s^2: 2 mg, far above the error of a calibrated unit."""
 
 
 RATE_TOLERANCE: Final = 1.0 * DEG_PER_H
-"""Of the mean rate, rad/s: what pulses and a bench that sways a little leave of half a minute."""
+"""Tolerance of the mean rate, rad/s: pulses and a slightly swaying bench, over half a minute."""
 
 
 ANOTHER_POSE: Final = 30.0 * DEG
-"""Gravity so far off its axis is not a lean any more, rad."""
+"""Angle of gravity from its axis above which the pose is another one, rad."""
 
 
-def axis_faults(
-    f_b: Array, omega_b: Array, step: Step, limits: ProcedureLimits, gravity: float, latitude_rad: float
-) -> tuple[str, ...]:
-    """Why the mean readings at rest are not those of a sound unit in the pose of a step.
+def sensor_faults(
+    averages: RestAverages, status: Conditions, limits: ProcedureLimits, calibration: Calibration
+) -> tuple[Message, ...]:
+    """Return what is wrong with status bits, temperatures and noise at rest.
 
     Parameters
     ----------
-    f_b, omega_b : ndarray, shape (3,)
-        Means of specific force and rate over 30 s or more, m/s^2 and rad/s, body axes.
-    step : Step
-        Its pose.
-    limits : Limits
-        Heading and tilt that it may have.
-    gravity : float
-        At the site, m/s^2.
-    latitude_rad : float
-        Of the site.
+    averages : RestAverages
+        Of 30 s or more.
+    status : Conditions
+        Reported by the unit.
+    limits : ProcedureLimits
+        Largest noise.
+    calibration : Calibration
+        Its temperature range.
 
     Returns
     -------
-    tuple of str
-        Each with what was read, what was expected, and what explains it; empty: all is well.
+    tuple of Message
+        Empty if nothing is.
     """
-    pose = _Pose(step, limits, gravity, latitude_rad)
+    reasons = []
+    if averages.flags & Flag.FAULT or status.faults:
+        reasons.append(fault_message(status.faults))
+    if calibration.temperature is not None:
+        low, high = calibration.temperature.range_degc
+        outside = [
+            message("temperature", channel=name, temperature_degc=t, low_degc=low, high_degc=high)
+            for name, t in status.temperature_degc.items()
+            if t is not None and not low <= t <= high
+        ]
+        if not outside and averages.flags & Flag.TEMPERATURE_RANGE:
+            outside = [message("some_temperature", low_degc=low, high_degc=high)]
+        reasons += outside
+    rate_noise, force_noise = averages.noise()
+    noise, limit = rate_noise / DEG, limits.noise_deg_per_s
+    if noise > limit:
+        reasons.append(message("gyro_noise", noise_deg_per_s=noise, limit_deg_per_s=limit))
+    noise, limit = force_noise / MG, limits.noise_mg
+    if noise > limit:
+        reasons.append(message("accelerometer_noise", noise_mg=noise, limit_mg=limit))
+    return tuple(reasons)
+
+
+def axis_faults(
+    averages: RestAverages, step: Step, limits: ProcedureLimits, site: Site
+) -> tuple[Message, ...]:
+    """Return why the mean readings at rest are not those of a sound unit in the pose of a step.
+
+    Parameters
+    ----------
+    averages : RestAverages
+        Of 30 s or more.
+    step : Step
+        Its pose.
+    limits : ProcedureLimits
+        Largest deviations of heading and tilt.
+    site : Site
+        Location of the unit.
+
+    Returns
+    -------
+    tuple of Message
+        Each with the reading, the expected one, and what explains it; empty if all agree.
+    """
+    f_b, omega_b, gravity = averages.force, averages.rate, site.gravity
+    pose = _Pose(step, limits, gravity, site.latitude_rad)
     reasons = []
     size = float(np.linalg.norm(f_b))
     if abs(size - gravity) > GRAVITY_TOLERANCE:
         reasons.append(
-            f"gravity reads {size:.3f} m/s^2 where {gravity:.3f} +- {GRAVITY_TOLERANCE:g} is expected: "
-            "check the accelerometers' scale factors and biases, and the site"
+            message("gravity", measured_m_s2=size, expected_m_s2=gravity, tolerance_m_s2=GRAVITY_TOLERANCE)
         )
     rate = float(np.linalg.norm(omega_b))
     if abs(rate - EARTH_RATE) > RATE_TOLERANCE:
         reasons.append(
-            f"the Earth's rotation reads {rate / DEG_PER_H:.1f} deg/h where {EARTH_RATE / DEG_PER_H:.1f} +- "
-            f"{RATE_TOLERANCE / DEG_PER_H:g} is expected: check the gyros' scale factors and biases"
+            message(
+                "earth_rate",
+                measured_deg_per_h=rate / DEG_PER_H,
+                expected_deg_per_h=EARTH_RATE / DEG_PER_H,
+                tolerance_deg_per_h=RATE_TOLERANCE / DEG_PER_H,
+            )
         )
     if size < 0.5 * gravity or rate < 0.5 * EARTH_RATE or reasons:
         return tuple(reasons)
     if not pose.fits(f_b, omega_b):
-        reasons.append(f"{pose.differences(f_b, omega_b)}: {pose.causes(f_b, omega_b)}")
+        readings, cause = pose.differences(f_b, omega_b), pose.cause(f_b, omega_b)
+        reasons.append(message("axis_fault", readings=readings, cause=cause))
     elif (lean := pose.lean(f_b)) > limits.tilt_deg * DEG:
-        reasons.append(
-            f"the {side(step.up)} side leans {lean / DEG:.1f} deg, want {limits.tilt_deg:g} at most"
-        )
+        reasons.append(lean_message(lean, step, limits))
     return tuple(reasons)
 
 
 class _Pose:
-    """What a pose should read, and how far off readings are."""
+    """Expected readings of a pose, and the deviations from them."""
 
     def __init__(self, step: Step, limits: ProcedureLimits, gravity: float, latitude_rad: float) -> None:
         self._step, self._heading_limit, self._gravity = step, limits.heading_deg * DEG, gravity
@@ -94,11 +150,11 @@ class _Pose:
         return acos(float(np.clip(f_b @ self._up_b / np.linalg.norm(f_b), -1.0, 1.0)))
 
     def vertical_off(self, f_b: Array, omega_b: Array) -> float:
-        """Vertical part of the rate less what it should be, rad/s; the same in every pose."""
+        """Error of the vertical part of the rate, rad/s; the same in every pose."""
         return float(f_b @ omega_b / np.linalg.norm(f_b)) - self._vertical
 
     def clockwise(self, f_b: Array, omega_b: Array) -> float:
-        """How far the pose is turned clockwise, seen from above, rad, -pi to pi."""
+        """Clockwise deviation from the heading of the pose, seen from above, rad, -pi to pi."""
         up = f_b / np.linalg.norm(f_b)
         east = np.cross(omega_b, up)
         return -atan2(float(self._east_b @ np.cross(up, east)), float(self._east_b @ east))
@@ -110,58 +166,66 @@ class _Pose:
             and abs(self.clockwise(f_b, omega_b)) <= self._heading_limit
         )
 
-    def differences(self, f_b: Array, omega_b: Array) -> str:
-        """Say the readings that are not as expected."""
+    def differences(self, f_b: Array, omega_b: Array) -> tuple[Message, ...]:
+        """Return the readings that are not as expected."""
         found = []
         expected = self._gravity * self._up_b
         for k, axis in enumerate("XYZ"):
             if abs(f_b[k] - expected[k]) > 0.5 * self._gravity:
+                read, wanted = float(f_b[k]), float(expected[k])
                 found.append(
-                    f"accelerometer {axis} reads {f_b[k]:+.2f} where {expected[k]:+.2f} m/s^2 is expected"
+                    message("accelerometer_reads", axis=axis, measured_m_s2=read, expected_m_s2=wanted)
                 )
         upright = self.lean(f_b) < ANOTHER_POSE
         if upright and abs(self.vertical_off(f_b, omega_b)) > RATE_TOLERANCE:
-            k = int(np.argmax(np.abs(self._up_b)))
-            found.append(_gyro(k, omega_b, self._omega_b))
+            found.append(self._gyro(int(np.argmax(np.abs(self._up_b))), omega_b))
         elif upright and abs(self.clockwise(f_b, omega_b)) > self._heading_limit:
             off = np.abs(omega_b - self._omega_b)
-            found += [_gyro(k, omega_b, self._omega_b) for k in range(3) if off[k] > 0.5 * off.max()]
-        return ", ".join(found)
+            found += [self._gyro(k, omega_b) for k in range(3) if off[k] > 0.5 * off.max()]
+        return tuple(found)
 
-    def causes(self, f_b: Array, omega_b: Array) -> str:
-        """Name the single causes that explain the readings."""
+    def _gyro(self, k: int, omega_b: Array) -> Message:
+        read, wanted = float(omega_b[k]) / DEG_PER_H, float(self._omega_b[k]) / DEG_PER_H
+        return message("gyro_reads", axis="XYZ"[k], measured_deg_per_h=read, expected_deg_per_h=wanted)
+
+    def cause(self, f_b: Array, omega_b: Array) -> Message:
+        """Return the single causes that explain the readings."""
         found = []
         if abs(self.vertical_off(f_b, omega_b)) <= RATE_TOLERANCE:
             up = axis_name(f_b)
-            turned = self.clockwise(f_b, omega_b)
             if up != self._step.up:
-                found.append(f"the unit stands with its {side(up)} side up")
+                found.append(message("other_side", side=side(up)))
             else:
-                found.append(f"the unit is to be turned {turn_instruction(turned)}")
-        found += [name.format("accelerometer") for name, P in _MISTAKES if self.fits(P @ f_b, omega_b)]
-        found += [name.format("gyro") for name, P in _MISTAKES if self.fits(f_b, P @ omega_b)]
+                found.append(message("other_heading", turn=turn_message(self.clockwise(f_b, omega_b))))
+        found += [accelerometer for P, accelerometer, _ in _MISTAKES if self.fits(P @ f_b, omega_b)]
+        found += [gyro for P, _, gyro in _MISTAKES if self.fits(f_b, P @ omega_b)]
         if not found:
-            return (
-                "neither another pose nor one reversed axis nor two exchanged explain it; check C_ba and C_bg"
-            )
-        return " or ".join(found) + ("; this cannot be told apart here" if len(found) > 1 else "")
+            return message("unexplained")
+        causes = reduce(lambda first, second: message("either", first=first, second=second), found)
+        return message("ambiguous", causes=causes) if len(found) > 1 else causes
 
 
-def _gyro(k: int, omega_b: Array, expected: Array) -> str:
-    read, want = omega_b[k] / DEG_PER_H, expected[k] / DEG_PER_H
-    return f"gyro {'XYZ'[k]} reads {read:+.1f} where {want:+.1f} deg/h is expected"
-
-
-def _mistakes() -> list[tuple[str, Array]]:
+def _mistakes() -> list[tuple[Array, Message, Message]]:
+    """Return what each mistake does to a vector, and its message for accelerometers and for gyros."""
     reversed_axes = [
-        (f"{{}} {a} is reversed", np.diag(np.where(np.arange(3) == k, -1.0, 1.0)))
-        for k, a in enumerate("XYZ")
+        (
+            np.diag(np.where(np.arange(3) == k, -1.0, 1.0)),
+            message("accelerometer_reversed", axis=axis),
+            message("gyro_reversed", axis=axis),
+        )
+        for k, axis in enumerate("XYZ")
     ]
     exchanged = []
     for i, j in combinations(range(3), 2):
-        P = np.eye(3)
+        P, first, second = np.eye(3), "XYZ"[i], "XYZ"[j]
         P[[i, j]] = P[[j, i]]
-        exchanged.append((f"{{}}s {'XYZ'[i]} and {'XYZ'[j]} are exchanged", P))
+        exchanged.append(
+            (
+                P,
+                message("accelerometers_exchanged", first=first, second=second),
+                message("gyros_exchanged", first=first, second=second),
+            )
+        )
     return reversed_axes + exchanged
 
 

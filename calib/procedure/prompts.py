@@ -1,198 +1,275 @@
-"""The words of the bench procedure: what to do now, which way, what is expected, from what sensors show."""
+"""Prompts of the bench procedure: what to do now, which way, what is expected, from what the sensors show."""
 
 from dataclasses import dataclass
 from math import pi
-from typing import Final, TypeAlias
+from typing import Final, NamedTuple
 
 from calib.axes import axis_name, opposite, side, vector
 from calib.detection.tracking import AttitudeTracker, RotationTracker, StillnessDetector
+from calib.procedure.events import Accepted
+from calib.procedure.messages import Message, message
 from calib.procedure.schema import ProcedureLimits, Step
 from imudrv.records import Flag
 from imudrv.units import DEG
 
-Says: TypeAlias = tuple[str, tuple[str, ...]]
-"""A headline of at most 38 characters, and hints."""
-
-
 READY_S: Final = 1.0
-"""The unit has been set down when it stands still for so long, s."""
+"""Rest after which the unit counts as set down, s."""
 
 
-NAMED_RAD: Final = 10.0 * DEG
-"""A turn of less has no way and no axis yet."""
+MIN_ROTATION_RAD: Final = 10.0 * DEG
+"""Smallest rotation of which direction and axis are judged."""
 
 
-_AHEAD_S: Final = 0.3  # a person stops so long after the word
+_REACTION_S: Final = 0.3  # from the word to the end of the motion
 
 
-_LONG_S: Final = 5.0  # so long in the wrong pose is no passing moment
+_LONG_S: Final = 5.0  # a wrong pose for this long is no passing moment
 
 
-_COMPASS: Final = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")
+_COMPASS: Final = (
+    message("north"),
+    message("north_east"),
+    message("east"),
+    message("south_east"),
+    message("south"),
+    message("south_west"),
+    message("west"),
+    message("north_west"),
+)
 
 
-def turn_instruction(clockwise_rad: float) -> str:
-    """Say the turn that takes back one of so much clockwise: ``90 deg clockwise, seen from above``."""
-    turn = "counter-clockwise" if clockwise_rad > 0.0 else "clockwise"
-    return f"{abs(clockwise_rad) / DEG:.0f} deg {turn}, seen from above"
+class Prompt(NamedTuple):
+    """Headline of at most 38 characters, and hints."""
 
-
-def pose_text(step: Step) -> str:
-    """Say a pose."""
-    north = axis_name(step.C_bn[:, 1])
-    return f"{side(step.up)} up, {side(step.east)} about east, {side(north)} about north"
-
-
-def wrong_direction_text(angle_rad: float, step: Step) -> str:
-    """Say that a turn has the wrong sign."""
-    return f"turns the wrong way: {angle_rad / DEG:+.0f} deg, want {step.turn_deg:+d}"
+    headline: Message
+    hints: tuple[Message, ...] = ()
 
 
 @dataclass(frozen=True)
 class StepObservation:
-    """What the sensors show, and what the step wants.
+    """Sensors against what the step requires.
 
     Attributes
     ----------
     step : Step
         The current one.
-    limits : Limits
+    limits : ProcedureLimits
         Of the procedure.
-    posture : Posture
-        How the unit lies.
-    still : Stillness
-        Whether it stands still.
+    attitude : AttitudeTracker
+        Attitude of the unit.
+    stillness : StillnessDetector
+        Whether it is at rest.
     flags : int
         `Flag` bits of the newest block.
     faults : tuple of str
-        Names of the faults that the unit tells.
+        Names of the faults that the unit reports.
     """
 
     step: Step
     limits: ProcedureLimits
-    posture: AttitudeTracker
-    still: StillnessDetector
+    attitude: AttitudeTracker
+    stillness: StillnessDetector
     flags: int
     faults: tuple[str, ...]
 
     @property
     def upright(self) -> bool:
         """Whether the right side is up."""
-        return self.posture.lean(vector(self.step.up)) <= self.limits.tilt_deg * DEG
+        return self.attitude.lean(vector(self.step.up)) <= self.limits.tilt_deg * DEG
 
     @property
     def clockwise(self) -> float | None:
-        """How far the pose is turned clockwise, rad, -pi to pi; None: not known."""
-        azimuth = self.posture.azimuth(vector(self.step.east))
+        """Clockwise deviation from the heading of the pose, rad, -pi to pi; None: not known."""
+        azimuth = self.attitude.azimuth(vector(self.step.east))
         return None if azimuth is None else (azimuth + 0.5 * pi) % (2.0 * pi) - pi
 
     @property
     def placed(self) -> bool:
-        """Whether the unit lies as the step wants it, as far as it is known."""
+        """Whether the unit is in the pose of the step, as far as known."""
         return self.upright and abs(self.clockwise or 0.0) <= self.limits.heading_deg * DEG
 
     @property
-    def unfit(self) -> str:
-        """Why the unit cannot measure, if it cannot."""
+    def unfit(self) -> Message | None:
+        """Reason why the unit cannot measure."""
         if self.flags & Flag.FAULT:
-            names = f": {', '.join(self.faults)}" if self.faults else ""
-            return f"the unit tells a fault{names}"
-        return "the unit is warming up" if self.flags & Flag.WARM_UP else ""
+            return fault_message(self.faults)
+        return message("unit_warming_up") if self.flags & Flag.WARM_UP else None
 
     @property
     def ready(self) -> bool:
-        """Whether the sensors agree that the unit stands as the step wants it."""
-        return self.placed and self.still.quiet_s >= READY_S and not self.unfit
+        """Whether the unit is at rest in the pose of the step, and can measure."""
+        return self.placed and self.stillness.quiet_s >= READY_S and not self.unfit
 
 
-def preflight(seen: StepObservation, failed: bool) -> Says:
-    """For the preflight; `failed`: the last check found something."""
-    if seen.flags & Flag.WARM_UP:
-        return "WARMING UP, WAIT", ("the unit's warm-up bit is set",)
-    if seen.still.moving or not (seen.upright or failed):
-        return f"SET IT DOWN: {side(seen.step.up)} UP", (pose_text(seen.step), *_motion(seen))
+def fault_message(faults: tuple[str, ...]) -> Message:
+    """Return the message of the faults that the unit reports."""
+    return message("fault", faults=faults) if faults else message("unnamed_fault")
+
+
+def turn_message(clockwise_rad: float) -> Message:
+    """Return the turn that undoes a clockwise one: ``90 deg counter-clockwise, seen from above``."""
+    angle_deg = abs(clockwise_rad) / DEG
+    if clockwise_rad > 0.0:
+        return message("counter_clockwise", angle_deg=angle_deg)
+    return message("clockwise", angle_deg=angle_deg)
+
+
+def pose_message(step: Step) -> Message:
+    """Return the message of a pose."""
+    north = axis_name(step.C_bn[:, 1])
+    return message("pose", up=side(step.up), east=side(step.east), north=side(north))
+
+
+def wrong_direction(angle_deg: float, step: Step) -> Message:
+    """Return the message of a rotation with the wrong sign."""
+    return message("wrong_direction", angle_deg=angle_deg, expected_deg=step.turn_deg)
+
+
+def lean_message(lean_rad: float, step: Step, limits: ProcedureLimits) -> Message:
+    """Return the message of an upper axis that is not vertical."""
+    return message("leans", side=side(step.up), lean_deg=lean_rad / DEG, limit_deg=limits.tilt_deg)
+
+
+def preflight(observed: StepObservation, failed: bool) -> Prompt:
+    """Prompt for the preflight; `failed`: the latest check has found something."""
+    pose = pose_message(observed.step)
+    if observed.flags & Flag.WARM_UP:
+        return Prompt(message("warming_up"), (message("unit_warming_up"),))
+    if observed.stillness.moving or not (observed.upright or failed):
+        return Prompt(message("set_down_side", side=side(observed.step.up)), (pose, *_motion(observed)))
     if failed:
-        return "CHECK FAILED: SEE WHY", (
-            pose_text(seen.step),
-            "it is checked again and again, and goes on when all is well",
-        )
-    return "HANDS OFF, CHECKING", (pose_text(seen.step),)
+        return Prompt(message("check_failed"), (pose, message("check_repeats")))
+    return Prompt(message("checking"), (pose,))
 
 
-def place(seen: StepObservation, hands_free: bool) -> Says:
-    """For placing the unit; `hands_free`: nobody is asked to confirm."""
-    step = seen.step
-    if not seen.upright:
-        return f"TURN IT: {side(step.up)} UP", (*_tip(seen), pose_text(step))
-    if not seen.placed:
-        clockwise = seen.clockwise or 0.0
-        word = "COUNTER-CLOCKWISE" if clockwise > 0.0 else "CLOCKWISE"
-        hint = (
-            f"{side(step.east)} points {abs(clockwise) / DEG:.0f} deg off east, want "
-            f"{seen.limits.heading_deg:g} at most: turn it {turn_instruction(clockwise)}"
-        )
-        return f"TURN IT {abs(clockwise) / DEG:.0f} DEG {word}", (hint, pose_text(step))
-    if seen.unfit:
-        return "WAIT FOR THE UNIT", (seen.unfit,)
-    if seen.still.quiet_s < READY_S:
-        return "SET IT DOWN, HANDS OFF", (pose_text(step), *_motion(seen))
-    return "HANDS OFF" if hands_free else "READY: CONFIRM", (pose_text(step),)
+def place(observed: StepObservation, hands_free: bool) -> Prompt:
+    """Prompt for placing the unit; `hands_free`: nobody is asked to confirm."""
+    step, pose = observed.step, pose_message(observed.step)
+    if not observed.upright:
+        return Prompt(message("side_up", side=side(step.up)), (*_tip(observed), pose))
+    if not observed.placed:
+        return _turn_to_heading(observed, observed.clockwise or 0.0)
+    if observed.unfit:
+        return Prompt(message("wait_for_unit"), (observed.unfit,))
+    if observed.stillness.quiet_s < READY_S:
+        return Prompt(message("set_down"), (pose, *_motion(observed)))
+    return Prompt(message("hands_off") if hands_free else message("confirm"), (pose,))
 
 
-def settle(seen: StepObservation) -> Says:
-    """For standing still before the alignment."""
-    if seen.unfit:
-        return "WAIT FOR THE UNIT", (seen.unfit,)
-    return "HANDS OFF, SETTLING", _motion(seen)
+def settle(observed: StepObservation) -> Prompt:
+    """Prompt for the rest before the alignment."""
+    if observed.unfit:
+        return Prompt(message("wait_for_unit"), (observed.unfit,))
+    return Prompt(message("settling"), _motion(observed))
 
 
-def rotate(seen: StepObservation, turn: RotationTracker) -> Says:
-    """For the turn."""
-    step, limits = seen.step, seen.limits
-    whole = abs(step.turn_deg) * DEG
-    how = "counter-clockwise" if step.turn_deg > 0 else "clockwise"
-    plain = (f"{abs(step.turn_deg)} deg {how}, seen from above, in 2 to 3 s; then hands off",)
-    if turn.begun is None:
-        return f"ROTATE NOW {step.turn_deg:+d}", plain
-    if turn.size > NAMED_RAD:
-        if turn.axis_tilt > limits.axis_tilt_deg * DEG:
-            return "WRONG AXIS", (
-                f"turns about {turn.about}, {turn.axis_tilt / DEG:.0f} deg off the vertical, want "
-                f"{limits.axis_tilt_deg:g} at most: keep {side(step.up)} up",
-            )
-        if turn.angle * step.turn_deg < 0.0:
-            return "WRONG WAY", (wrong_direction_text(turn.angle, step),)
-    done = abs(turn.angle)
-    if done + abs(turn.rate) * _AHEAD_S >= whole:
-        return "STOP", (f"stop at {abs(step.turn_deg)} deg, hands off",)
+def align() -> Prompt:
+    """Prompt for the alignment."""
+    return Prompt(message("aligning"), (message("do_not_touch"),))
+
+
+def rotate(observed: StepObservation, rotation: RotationTracker) -> Prompt:
+    """Prompt for the rotation."""
+    step, limits = observed.step, observed.limits
+    whole, angle_deg = abs(step.turn_deg) * DEG, rotation.angle / DEG
+    instruction = message("rotation", turn=turn_message(step.turn_deg * DEG))
+    if rotation.begun is None:
+        return Prompt(message("rotate_now", turn_deg=step.turn_deg), (instruction,))
+    if rotation.size > MIN_ROTATION_RAD:
+        if rotation.axis_tilt > limits.axis_tilt_deg * DEG:
+            return Prompt(message("wrong_axis"), (_off_axis(observed, rotation),))
+        if rotation.angle * step.turn_deg < 0.0:
+            return Prompt(message("wrong_way"), (wrong_direction(angle_deg, step),))
+    done = abs(rotation.angle)
+    if done + abs(rotation.rate) * _REACTION_S >= whole:
+        return Prompt(message("stop"), (message("stop_at", angle_deg=abs(step.turn_deg)),))
     if done >= whole - limits.angle_tolerance_deg * DEG:
-        return "HOLD STILL", (f"turned {turn.angle / DEG:+.0f} deg",)
-    # a smooth turn is nearly at its fastest from a quarter of the way on
-    if 0.25 < done / whole < 0.7 and turn.peak < 0.9 * limits.least_peak_deg_per_s * DEG:
-        return "FASTER", (f"peak {turn.peak / DEG:.0f} deg/s, want {limits.least_peak_deg_per_s:g} at least",)
-    return f"ROTATE {step.turn_deg:+d}", plain
+        return Prompt(message("hold_still"), (message("turned", angle_deg=angle_deg),))
+    # a smooth rotation is nearly at its fastest from a quarter of the way on
+    peak, least = rotation.peak / DEG, limits.least_peak_deg_per_s
+    if 0.25 < done / whole < 0.7 and peak < 0.9 * least:
+        return Prompt(message("faster"), (message("slow", peak_deg_per_s=peak, limit_deg_per_s=least),))
+    return Prompt(message("rotate", turn_deg=step.turn_deg), (instruction,))
 
 
-def _tip(seen: StepObservation) -> tuple[str, ...]:
-    """Which way to tip the unit so that the right side comes up."""
-    want, now, posture = seen.step.up, seen.posture.up, seen.posture
-    if now == want:
-        lean = posture.lean(vector(want)) / DEG
-        return (f"the {side(now)} side leans {lean:.0f} deg, want {seen.limits.tilt_deg:g} at most",)
-    task = f"the {side(now)} side is up, turn the {side(want)} side up"
-    if now[1] == want[1]:
-        hint, cause = f"{task}: turn it over, 180 deg", f"accelerometer {want[1]} is reversed"
+def rest() -> Prompt:
+    """Prompt for the rest after the rotation."""
+    return Prompt(message("resting"), (message("do_not_touch"),))
+
+
+def verdict(step: Step, number: int, steps: int, accepted: Accepted | None) -> Prompt:
+    """Verdict on an attempt; None: it was rejected."""
+    if accepted is None:
+        return Prompt(message("rejected"), (pose_message(step),))
+    hint = message(
+        "accepted",
+        angle_deg=accepted.angle_deg,
+        duration_s=accepted.duration_s,
+        peak_deg_per_s=accepted.peak_deg_per_s,
+    )
+    return Prompt(message("step_done", step=number, steps=steps), (hint,))
+
+
+def done(accepted: int, steps: int) -> Prompt:
+    """Prompt for the end."""
+    return Prompt(message("all_done"), (message("count", accepted=accepted, skipped=steps - accepted),))
+
+
+def aborted() -> Prompt:
+    """Prompt for the end after an abort."""
+    return Prompt(message("aborted"))
+
+
+def _turn_to_heading(observed: StepObservation, clockwise: float) -> Prompt:
+    angle_deg = abs(clockwise) / DEG
+    hint = message(
+        "heading_off",
+        side=side(observed.step.east),
+        angle_deg=angle_deg,
+        limit_deg=observed.limits.heading_deg,
+        turn=turn_message(clockwise),
+    )
+    if clockwise > 0.0:
+        headline = message("turn_counter_clockwise", angle_deg=angle_deg)
     else:
-        # the upper side tips to where the one opposite to the wanted one looks
-        down = opposite(want)
-        azimuth = posture.azimuth(vector(down))
-        compass = "" if azimuth is None else f" ({_COMPASS[round(azimuth / (pi / 4.0)) % 8]})"
-        hint = f"{task}: roll it 90 deg toward its {side(down)} side{compass}"
-        cause = f"accelerometers {now[1]} and {want[1]} are exchanged"
-    if seen.still.quiet_s < _LONG_S:
+        headline = message("turn_clockwise", angle_deg=angle_deg)
+    return Prompt(headline, (hint, pose_message(observed.step)))
+
+
+def _off_axis(observed: StepObservation, rotation: RotationTracker) -> Message:
+    return message(
+        "off_axis",
+        axis=rotation.about,
+        tilt_deg=rotation.axis_tilt / DEG,
+        limit_deg=observed.limits.axis_tilt_deg,
+        side=side(observed.step.up),
+    )
+
+
+def _tip(observed: StepObservation) -> tuple[Message, ...]:
+    """Return how to tip the unit so that the right side comes up."""
+    wanted, now, attitude = observed.step.up, observed.attitude.up, observed.attitude
+    if now == wanted:
+        return (lean_message(attitude.lean(vector(wanted)), observed.step, observed.limits),)
+    if now[1] == wanted[1]:
+        hint = message("turn_over", now=side(now), wanted=side(wanted))
+        cause = message("accelerometer_reversed", axis=wanted[1])
+    else:
+        # the upper side tips toward the side opposite to the wanted one
+        down = opposite(wanted)
+        azimuth = attitude.azimuth(vector(down))
+        if azimuth is None:
+            hint = message("roll", now=side(now), wanted=side(wanted), down=side(down))
+        else:
+            compass = _COMPASS[round(azimuth / (pi / 4.0)) % 8]
+            hint = message(
+                "roll_toward", now=side(now), wanted=side(wanted), down=side(down), compass=compass
+            )
+        cause = message("accelerometers_exchanged", first=now[1], second=wanted[1])
+    if observed.stillness.quiet_s < _LONG_S:
         return (hint,)
-    return hint, f"if its {side(want)} side is up, {cause}: check the certificate"
+    return hint, message("suspect", side=side(wanted), cause=cause)
 
 
-def _motion(seen: StepObservation) -> tuple[str, ...]:
-    return (f"it moves: {seen.still.why}",) if seen.still.moving else ()
+def _motion(observed: StepObservation) -> tuple[Message, ...]:
+    return (message("moving", motion=observed.stillness.why),) if observed.stillness.moving else ()

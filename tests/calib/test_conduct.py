@@ -16,6 +16,7 @@ from rich.console import Console
 from calib.bench import controller as conducts
 from calib.bench.controller import SessionController
 from calib.bench.evidence import Result
+from calib.bench.journal import Entry
 from calib.bench.keys import Keyboard
 from calib.bench.queue_sink import QueueSink
 from calib.bench.screen import OperatorScreen, plain
@@ -23,6 +24,7 @@ from calib.bench.session import EmbeddedFile, Session
 from calib.bench.technician import BENCH, Mistake, technician_scenario
 from calib.bench.verify import verify
 from calib.procedure.events import View
+from calib.procedure.messages import Message, english
 from calib.procedure.plan import steps_left
 from calib.procedure.schema import Procedure
 from imudrv import profiles
@@ -208,6 +210,11 @@ def conducted(
     return conduct, screen.text.getvalue()
 
 
+def reasons(entry: Entry) -> list[str]:
+    """English reasons of a line of the journal."""
+    return [english(Message(**reason)) for reason in entry["reasons"]]
+
+
 def events(session: Session) -> list[str]:
     return [entry["event"] for entry in session.entries]
 
@@ -274,7 +281,7 @@ def test_a_mistake_is_journaled_with_its_reasons_and_its_evidence_kept(session: 
     scenario = technician_scenario(PROCEDURE, [Mistake("z-up", "short")], calibration=NOMINAL)
     _, text = conducted(session, performed(scenario))
     (rejected,) = (entry for entry in session.entries if entry["event"] == "rejected")
-    assert "turned 150" in rejected["reasons"][0]
+    assert "turned 150" in reasons(rejected)[0]
     assert "turned 150" in text
     assert session.accepted["z-up"]["recording"] == "run-z-up-2.mcap"
     before = session.entries[session.entries.index(rejected) - 1]
@@ -307,7 +314,7 @@ def test_where_the_history_does_not_reach_back_the_step_is_asked_again_with_the_
     _, text = conducted(session, list(batches), history_bytes=history_bytes)
     assert session.accepted == {}
     (rejected,) = (entry for entry in session.entries if entry["event"] == "rejected")
-    (reason,) = rejected["reasons"]
+    (reason,) = reasons(rejected)
     assert re.match(r"its recording does not cover counters \d+\.\.\d+: this computer", reason)
     assert reason in text
     assert "GOOD" not in text
@@ -325,7 +332,7 @@ def test_a_step_whose_recording_has_a_hole_is_done_again_and_then_counts(session
     aligning = int(batches[250].pulses["counter"][0])
     conducted(session, list(batches), dropped=range(aligning, aligning + 200))
     (rejected,) = (entry for entry in session.entries if entry["event"] == "rejected")
-    assert f"does not cover counters {aligning}..{aligning + 199}" in rejected["reasons"][0]
+    assert f"does not cover counters {aligning}..{aligning + 199}" in reasons(rejected)[0]
     assert session.accepted["z-up"]["recording"] == "run-z-up-2.mcap"
     assert verify(session.folder).faults == ()
 

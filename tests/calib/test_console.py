@@ -17,6 +17,7 @@ from calib.bench import block_letters
 from calib.bench.keys import Keyboard
 from calib.bench.screen import UNHEARD, UNREADABLE, OperatorScreen, plain, screen, with_port_state
 from calib.procedure.events import Abort, Confirm, Phase, Redo, Skip, View
+from calib.procedure.messages import english, verbatim
 from imudrv.diagnosis import LineState
 
 DEADLINE_S = 20.0
@@ -34,9 +35,9 @@ HEADLINES = (
     "STOP",
     "CHECK FAILED: SEE WHY",
     "GOOD: STEP 12 OF 20 DONE",
-    "THE UNIT TELLS A FAULT",
-    UNHEARD,
-    UNREADABLE,
+    "WAIT FOR THE UNIT",
+    english(UNHEARD),
+    english(UNREADABLE),
 )
 
 
@@ -59,7 +60,11 @@ def view(phase: Phase = Phase.PLACE, headline: str = "TURN IT: X UP", **changes:
         "actions": ("confirm", "redo", "skip", "abort"),
         "bells": 0,
     }
-    return View(phase=phase, headline=headline, **{**values, **changes})
+    values |= changes
+    for name in ("hints", "reasons"):
+        values[name] = tuple(map(verbatim, values[name]))
+    values["title"] = verbatim(values["title"])
+    return View(phase=phase, headline=verbatim(headline), **values)
 
 
 def rows(shown: View, width: int = 80, height: int = 24, **options: Any) -> list[str]:

@@ -10,14 +10,14 @@ import pytest
 
 from calib.detection.acceptance import rejection_reasons
 from calib.detection.segments import find_segments
-from calib.procedure.engine import (
+from calib.procedure.engine import Engine
+from calib.procedure.events import (
     Abort,
     Aborted,
     Accepted,
     Checked,
     Conditions,
     Confirm,
-    Engine,
     Entered,
     Event,
     Finished,
@@ -30,6 +30,7 @@ from calib.procedure.engine import (
     Skipped,
     View,
 )
+from calib.procedure.messages import english
 from calib.procedure.schema import Procedure
 from imudrv.files.settings_file import parse
 from imudrv.nav.earth import EARTH_RATE
@@ -61,6 +62,11 @@ def plan(*poses: dict[str, Any], **limits: float) -> Procedure:
     return parse(document, Procedure, "test")
 
 
+def reasons(of: Any) -> list[str]:
+    """English reasons of a view or an event."""
+    return [english(reason) for reason in of.reasons]
+
+
 class Driver:
     """Feeds an engine, and keeps what it says."""
 
@@ -78,7 +84,7 @@ class Driver:
         return self
 
     def act(self, action: Any) -> tuple[Event, ...]:
-        events = self.engine.act(action)
+        events = self.engine.handle(action)
         self.events += events
         return events
 
@@ -91,12 +97,12 @@ class Driver:
 
     @property
     def headlines(self) -> list[str]:
-        said = [view.headline for view in self.views]
+        said = [english(view.headline) for view in self.views]
         return [b for a, b in pairwise(["", *said]) if a != b]
 
     @property
     def hints(self) -> set[str]:
-        return {hint for view in self.views for hint in view.hints}
+        return {english(hint) for view in self.views for hint in view.hints}
 
 
 @pytest.fixture
@@ -231,7 +237,7 @@ def test_without_a_confirmation_it_waits_for_ever(drive: Drive, bench: Bench, st
     driver = drive(hands_free=False).feed(bench(step(CHECK_S + 600.0)))
 
     assert driver.phases == ["preflight", "place"]
-    assert driver.engine.view.headline == "READY: CONFIRM"
+    assert english(driver.engine.view.headline) == "READY: CONFIRM"
     assert "confirm" in driver.engine.view.actions
 
 
@@ -251,7 +257,7 @@ def test_a_confirmation_counts_for_its_step_only_and_only_while_the_sensors_agre
     driver.feed(part(samples, CHECK_S + 4.0, CHECK_S + 10.0))
     assert not driver.act(Confirm("x"))  # of a later step
     driver.feed(part(samples, CHECK_S + 10.0, CHECK_S + 20.0))
-    assert driver.engine.view.headline == "TURN IT: Z UP"
+    assert english(driver.engine.view.headline) == "TURN IT: Z UP"
     assert not driver.act(Confirm("z"))  # in the wrong pose
     assert "confirm" not in driver.engine.view.actions
 
@@ -301,7 +307,7 @@ def test_a_step_that_was_accepted_is_done_again_with_the_old_evidence_kept(
     assert len(driver.of(Finished)) == 2
     # after the first turn the pose was the other way round, and said so
     assert (
-        "X points 180 deg off east, want 45 at most: turn it 180 deg clockwise, seen from above"
+        "X points 180 deg off east, expected at most 45: turn it 180 deg clockwise, seen from above"
         in driver.hints
     )
 
@@ -332,7 +338,7 @@ def test_a_skipped_step_is_left_out_and_what_is_then_not_seen_is_said(drive: Dri
     assert isinstance(skipped, Skipped)
     assert entered.phase is Phase.DONE
     assert (finished.accepted, finished.skipped) == (("z",), ("x",))
-    assert "expected rotations that determine 6 directions" in finished.reasons[0]
+    assert "expected rotations that determine 6 directions" in english(finished.reasons[0])
     assert driver.engine.view.reasons == finished.reasons
     assert driver.act(Skip("x")) == ()
     assert [type(e) for e in driver.act(Redo("x"))] == [Redone, Entered]
@@ -382,14 +388,14 @@ def test_an_accepted_step_whose_evidence_was_not_kept_is_asked_again(
     assert (rejected.step_id, rejected.attempt) == ("z", 1)
     assert entered.phase is Phase.VERDICT
     assert driver.engine.accepted == {}
-    assert driver.engine.view.headline == "REJECTED: DO IT AGAIN"
-    assert driver.engine.view.reasons == ("the disk is full",)
+    assert english(driver.engine.view.headline) == "REJECTED: DO IT AGAIN"
+    assert reasons(driver.engine.view) == ["the disk is full"]
     rest = np.tile(turned[-1000:], 3)  # 6 s: the verdict has been shown
     rest["counter"] = newest + 1 + np.arange(len(rest))
     driver.feed(rest)
     placed = [(e.step_id, e.attempt) for e in driver.of(Entered) if e.phase is Phase.PLACE]
     assert placed == [("z", 1), *[("x", 1) for _ in poses[1:]], ("z", 2)]
-    assert driver.engine.view.reasons == ("the disk is full",)
+    assert reasons(driver.engine.view) == ["the disk is full"]
 
 
 def test_after_an_abort_nothing_is_asked_again(drive: Drive, turned: Records) -> None:
@@ -445,7 +451,7 @@ def test_samples_that_are_missing_begin_the_alignment_again_with_their_number(
         driver = drive().feed(np.delete(turned, slice(20_002, 20_002 + missing)))
 
         restarted = driver.of(Restarted)[0]
-        assert restarted.reason == f"{missing} samples missing 8 s into the alignment"
+        assert reasons(restarted) == [f"alignment interrupted after 8 s: {missing} samples missing"]
         assert driver.phases[3:6] == ["align", "settle", "align"]
 
 
@@ -462,20 +468,20 @@ def test_a_sample_that_is_missing_in_the_turn_rejects_it(drive: Drive, turned: R
     driver = drive().feed(np.delete(turned, [during]))
 
     (rejected,) = driver.of(Rejected)
-    assert rejected.reasons == ("1 samples missing during the rotation, want at most 0",)
+    assert reasons(rejected) == ["1 samples missing during the rotation, want at most 0"]
     assert driver.phases[-2:] == ["verdict", "place"]
 
 
 def test_the_cable_out_during_the_turn_or_the_rest_after_rejects_it(drive: Drive, turned: Records) -> None:
     turn_s = CHECK_S + ALIGN_S
     for begin_s, reason in (
-        (turn_s + 1.0, "250 samples missing during the turn"),
-        (turn_s + 4.0, "250 samples missing 1.5 s into the rest, want 3"),
+        (turn_s + 1.0, "during the rotation: 250 samples missing"),
+        (turn_s + 4.0, "rest interrupted after 1.5 s of 3: 250 samples missing"),
     ):
         at = round(begin_s / 2e-3)
         driver = drive().feed(np.delete(turned, slice(at, at + 250)))
 
-        assert driver.of(Rejected)[0].reasons == (reason,)
+        assert reasons(driver.of(Rejected)[0]) == [reason]
 
 
 def test_a_unit_that_restarts_begins_the_alignment_again(drive: Drive, turned: Records) -> None:
@@ -484,7 +490,7 @@ def test_a_unit_that_restarts_begins_the_alignment_again(drive: Drive, turned: R
     driver = drive().feed(turned)
 
     restarted = driver.of(Restarted)[0]
-    assert restarted.reason == "the unit restarted 8 s into the alignment"
+    assert reasons(restarted) == ["alignment interrupted after 8 s: the unit restarted"]
     assert restarted.counter < 100
 
 
@@ -492,11 +498,11 @@ def test_a_fault_of_the_unit_is_named_and_it_waits_until_it_is_gone(drive: Drive
     turned["flags"][20_000:22_000] |= np.uint32(Flag.FAULT)
     driver = drive()
     driver.feed(turned[:19_000])
-    driver.engine.conditions(Conditions(("dither fault",), ("dither fault",), {}))
+    driver.engine.update_status(Conditions(("dither fault",), ("dither fault",), {}))
     driver.feed(turned[19_000:])
 
     restarted = driver.of(Restarted)[0]
-    assert restarted.reason == "the unit tells a fault: dither fault 8 s into the alignment"
+    assert reasons(restarted) == ["alignment interrupted after 8 s: the unit reports a fault: dither fault"]
     assert "WAIT FOR THE UNIT" in driver.headlines
     assert [e.counter for e in driver.of(Entered) if e.phase is Phase.ALIGN][1] > 1000 + 22_000
 
@@ -509,7 +515,7 @@ def test_a_push_before_the_turn_disturbs_the_rest_and_aligns_again(
     )
 
     (restarted,) = driver.of(Restarted)
-    assert restarted.reason == "moved 2.0 deg before the turn: the rest is disturbed"
+    assert reasons(restarted) == ["moved 2.0 deg before the rotation: the rest is disturbed"]
     assert len(driver.of(Accepted)) == 1
 
 
@@ -517,10 +523,10 @@ def test_a_turn_about_another_axis_is_named(drive: Drive, bench: Bench, step: An
     driver = drive().feed(bench(step(CHECK_S + ALIGN_S), step(2.5, 180.0, (1.0, 0.0, 0.0)), step(9.0)))
 
     assert "WRONG AXIS" in driver.headlines
-    assert "turns about X, 90 deg off the vertical, want 10 at most: keep Z up" in driver.hints
+    assert "rotates about X, 90 deg off the vertical, expected at most 10: keep Z up" in driver.hints
     (rejected,) = driver.of(Rejected)
-    assert rejected.reasons[0] == "about X, expected Z"
-    assert driver.engine.view.headline == "TURN IT: Z UP"
+    assert reasons(rejected)[0] == "about X, expected Z"
+    assert english(driver.engine.view.headline) == "TURN IT: Z UP"
     assert "the -Z side is up, turn the Z side up: turn it over, 180 deg" in driver.hints
 
 
@@ -548,53 +554,53 @@ READINGS = {
     "upside down": (
         np.diag([1, -1, -1]),
         np.diag([1, -1, -1]),
-        ["accelerometer Z reads -9.79 where +9.79 m/s^2 is expected: the unit stands with its -Z side up"],
+        ["accelerometer Z reads -9.79 m/s^2, expected +9.79: the unit has its -Z side up"],
     ),
     "accelerometer reversed": (
         np.diag([1, 1, -1]),
         np.eye(3),
-        ["accelerometer Z reads -9.79 where +9.79 m/s^2 is expected: accelerometer Z is reversed"],
+        ["accelerometer Z reads -9.79 m/s^2, expected +9.79: accelerometer Z is reversed"],
     ),
     "gyro reversed": (
         np.eye(3),
         np.diag([1, 1, -1]),
-        ["gyro Z reads -7.1 where +7.1 deg/h is expected: gyro Z is reversed"],
+        ["gyro Z reads -7.1 deg/h, expected +7.1: gyro Z is reversed"],
     ),
     "accelerometers exchanged": (
         np.eye(3)[[0, 2, 1]],
         np.eye(3),
         [
-            "accelerometer Y reads +9.79 where +0.00 m/s^2 is expected, "
-            "accelerometer Z reads -0.00 where +9.79 m/s^2 is expected: "
+            "accelerometer Y reads +9.79 m/s^2, expected +0.00, "
+            "accelerometer Z reads -0.00 m/s^2, expected +9.79: "
             "accelerometers Y and Z are exchanged"
         ],
     ),
     "gyros exchanged": (
         np.eye(3),
         np.eye(3)[[0, 2, 1]],
-        ["gyro Z reads +13.2 where +7.1 deg/h is expected: gyros Y and Z are exchanged"],
+        ["gyro Z reads +13.2 deg/h, expected +7.1: gyros Y and Z are exchanged"],
     ),
     "the other way round": (
         np.diag([-1, -1, 1]),
         np.diag([-1, -1, 1]),
         [
-            "gyro Y reads -13.2 where +13.3 deg/h is expected: the unit is to be turned 180 deg clockwise, "
-            "seen from above or gyro Y is reversed; this cannot be told apart here"
+            "gyro Y reads -13.2 deg/h, expected +13.3: the unit has to be turned 180 deg clockwise, "
+            "seen from above or gyro Y is reversed; they cannot be distinguished in this pose"
         ],
     ),
     "two things at once": (
         np.diag([1, 1, -1]),
         np.eye(3)[[2, 0, 1]],
         [
-            "accelerometer Z reads -9.79 where +9.79 m/s^2 is expected: neither another pose nor one "
-            "reversed axis nor two exchanged explain it; check C_ba and C_bg"
+            "accelerometer Z reads -9.79 m/s^2, expected +9.79: not explained by another pose, one "
+            "reversed axis or two exchanged axes; check C_ba and C_bg"
         ],
     ),
     "accelerometer scale": (
         1.01 * np.eye(3),
         np.eye(3),
         [
-            "gravity reads 9.890 m/s^2 where 9.792 +- 0.02 is expected: check the accelerometers' scale "
+            "gravity reads 9.890 m/s^2, expected 9.792 +- 0.02: check the accelerometers' scale "
             "factors and biases, and the site"
         ],
     ),
@@ -602,7 +608,7 @@ READINGS = {
         np.eye(3),
         0.9 * np.eye(3),
         [
-            "the Earth's rotation reads 13.5 deg/h where 15.0 +- 1 is expected: check the gyros' scale "
+            "the Earth's rotation reads 13.5 deg/h, expected 15.0 +- 1: check the gyros' scale "
             "factors and biases"
         ],
     ),
@@ -613,7 +619,7 @@ READINGS = {
 def test_the_preflight_names_what_is_wrong_with_the_axes(
     name: str, drive: Drive, bench: Bench, step: Any
 ) -> None:
-    forces, rates, reasons = READINGS[name]
+    forces, rates, expected = READINGS[name]
     turned = bench(step(64.0), tilt=(0.0, 0.0, 0.0))
     turned["dv_b"] = turned["dv_b"] @ forces.T
     turned["dtheta_b"] = turned["dtheta_b"] @ rates.T
@@ -621,7 +627,7 @@ def test_the_preflight_names_what_is_wrong_with_the_axes(
     driver = drive().feed(turned)
 
     (rejected,) = driver.of(Rejected)  # once, though it is looked at again
-    assert (rejected.step_id, list(rejected.reasons)) == ("preflight", reasons)
+    assert (rejected.step_id, reasons(rejected)) == ("preflight", expected)
     assert driver.engine.view.phase is Phase.PREFLIGHT
 
 
@@ -637,8 +643,9 @@ def test_near_the_equator_a_reversed_gyro_is_not_told_from_a_sound_one(
 
     samples["dv_b"][:, 2] *= -1.0
     (rejected,) = Driver(there, plan()).feed(samples).of(Rejected)
-    assert rejected.reasons[0].endswith(
-        "the unit stands with its -Z side up or accelerometer Z is reversed; this cannot be told apart here"
+    assert reasons(rejected)[0].endswith(
+        "the unit has its -Z side up or accelerometer Z is reversed; "
+        "they cannot be distinguished in this pose"
     )
 
 
@@ -653,7 +660,7 @@ def test_an_axis_that_only_another_pose_shows_is_named_there(drive: Drive, bench
     driver.feed(part(samples, CHECK_S + 9.0, 100.0))
 
     (restarted,) = driver.of(Restarted)
-    assert restarted.reason.startswith("gyro X reads -7.1 where +7.1 deg/h is expected: gyro X is reversed")
+    assert reasons(restarted)[0].startswith("gyro X reads -7.1 deg/h, expected +7.1: gyro X is reversed")
 
 
 def test_temperature_noise_and_faults_are_held_against_the_limits(drive: Drive, turned: Records) -> None:
@@ -676,17 +683,17 @@ def test_temperature_noise_and_faults_are_held_against_the_limits(drive: Drive, 
     rng = np.random.default_rng(1)
     turned["dv_b"] += 8e-5 * rng.standard_normal(turned["dv_b"].shape)
     driver = drive(calibration=calibration, limits={"noise_mg": 0.5})
-    driver.engine.conditions(
+    driver.engine.update_status(
         Conditions(("power", "warm-up"), ("power",), {"gyro": 48.25, "accelerometer_x": None})
     )
     driver.feed(part(turned, 0.0, CHECK_S))
 
     (rejected,) = driver.of(Rejected)
-    fault, temperature, noise = rejected.reasons
-    assert fault == "the unit tells a fault: power"
-    assert temperature == "gyro at 48.2 degC, the certificate holds from 10 to 40: wait until it is there"
+    fault, temperature, noise = reasons(rejected)
+    assert fault == "the unit reports a fault: power"
+    assert temperature == "gyro at 48.2 degC, certificate valid from 10 to 40: wait"
     assert noise.startswith("accelerometer noise 2.08 ")
-    assert noise.endswith("mg rms at rest, want 0.5 at most: look for what shakes the bench")
+    assert noise.endswith("mg rms at rest, expected at most 0.5: check the bench for vibration")
 
 
 def test_a_small_motion_before_the_noise_is_known_is_left_out_of_the_check(
@@ -697,7 +704,7 @@ def test_a_small_motion_before_the_noise_is_known_is_left_out_of_the_check(
     (checked,) = driver.of(Checked)
     assert checked.counter >= 1000 + (14.0 + 30.0) / 2e-3 - 200
     assert not driver.of(Rejected)
-    assert any("did not stand still" in reason for view in driver.views for reason in view.reasons)
+    assert any("was not at rest" in reason for view in driver.views for reason in reasons(view))
 
 
 # Where to
@@ -720,15 +727,15 @@ def test_the_way_into_the_pose_is_said_from_gravity_and_heading(
     assert (
         "the Z side is up, turn the X side up: roll it 90 deg toward its -X side (east)",
         "X up, Y about east, Z about north",
-    ) in {view.hints for view in driver.views}
+    ) in {tuple(map(english, view.hints)) for view in driver.views}
     assert driver.engine.view.phase is Phase.ALIGN
 
 
 def test_headlines_fit_a_screen_that_is_read_from_afar(drive: Drive, turned: Records) -> None:
     driver = drive(Z, X).feed(turned)
 
-    assert max(len(view.headline) for view in driver.views) <= 38
-    assert driver.views[-1].title == "step 2 of 2: X up, +180 deg"
+    assert max(len(english(view.headline)) for view in driver.views) <= 38
+    assert english(driver.views[-1].title) == "step 2 of 2: X up, +180 deg"
     bells = [view.bells for view in driver.views]
     assert bells == sorted(bells)
     assert bells[-1] == 2  # the turn is due, the step is done

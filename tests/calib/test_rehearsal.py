@@ -12,7 +12,9 @@ from calib.bench.technician import Mistake, technician_scenario
 from calib.estimation.joint import estimate_joint
 from calib.estimation.result import TO_DIFFERENCES, LeverArmEstimate
 from calib.estimation.runs import NavigationOptions, navigate_rotations
-from calib.procedure.engine import Accepted, Engine, Event, Finished, Phase, Rejected, Restarted
+from calib.procedure.engine import Engine
+from calib.procedure.events import Accepted, Event, Finished, Phase, Rejected, Restarted
+from calib.procedure.messages import english
 from calib.procedure.plan import load, predicted
 from calib.procedure.schema import Procedure
 from imudrv import Coefficients, Compensator, coefficients, load_profile, rate_filter
@@ -98,8 +100,8 @@ def perform(procedure: Procedure, mistakes: Sequence[Mistake] = (), seed: int = 
     for begin, stop in pairwise([0, *cuts[cuts < len(samples)].tolist(), len(samples)]):
         events += engine.feed(samples[begin:stop])
         view = engine.view
-        assert len(view.headline) <= 38
-        said += [text for text in (view.headline, *view.hints) if text not in said[-8:]]
+        assert len(english(view.headline)) <= 38
+        said += [text for text in map(english, (view.headline, *view.hints)) if text not in said[-8:]]
     return Performance(scenario, procedure, engine, samples, events, said)
 
 
@@ -163,13 +165,13 @@ CLUMSY = {
     "touches it, turns the wrong way, stops short": (
         [Mistake("z-up", "moves"), Mistake("x-up", "wrong way"), Mistake("y-up", "short")],
         [
-            ("z-up", 1, "it moved (0.06 deg/s, limit 0.05) 40 s into the alignment"),
-            ("x-up", 1, "turns the wrong way: -40 deg, want +180"),
+            ("z-up", 1, "alignment interrupted after 40 s: the unit moved (0.06 deg/s, limit 0.05)"),
+            ("x-up", 1, "wrong direction: -40 deg, expected +180"),
             ("y-up", 1, "turned 150.0 deg, want 180 +- 5"),
         ],
         [
             "WRONG WAY",
-            r"turns the wrong way: -40 deg, want \+180",
+            r"wrong direction: -40 deg, expected \+180",
             r"TURN IT 1\d\d DEG CLOCKWISE",
         ],
     ),
@@ -177,18 +179,18 @@ CLUMSY = {
         [Mistake("z-up", "slow"), Mistake("x-up", "bump"), Mistake("y-up", "wrong pose")],
         [
             ("z-up", 1, "peak 42 deg/s: slower than 70, expect 4.2 mm"),
-            ("x-up", 1, "it moved (0.58 deg/s, limit 0.05) 4.0 s into the rest, want 15"),
+            ("x-up", 1, "rest interrupted after 4.0 s of 15: the unit moved (0.58 deg/s, limit 0.05)"),
         ],
         [
             "FASTER",
-            "peak 42 deg/s, want 70 at least",
+            "peak 42 deg/s, expected at least 70",
             "TURN IT: Y UP",
             r"the X side is up, turn the Y side up: roll it 90 deg toward its -Y side \(north\)",
         ],
     ),
     "unplugs the cable": (
         [Mistake("x-up", "unplug")],
-        [("x-up", 1, "3000 samples missing 30 s into the alignment")],
+        [("x-up", 1, "alignment interrupted after 30 s: 3000 samples missing")],
         [],
     ),
 }
@@ -201,7 +203,7 @@ def test_each_mistake_is_caught_named_and_made_good(name: str) -> None:
     done = perform(short(), mistakes)
 
     caught = [
-        (e.step_id, e.attempt, e.reason if isinstance(e, Restarted) else e.reasons[0])
+        (e.step_id, e.attempt, english(e.reasons[0]))
         for e in done.events
         if isinstance(e, Restarted | Rejected)
     ]

@@ -1,0 +1,66 @@
+"""Messages to the operator: keys with values; a catalogue for each language has the sentences.
+
+A catalogue is a YAML file with one line for each key; its text is a Python format string with the values of
+the message. Text from elsewhere (detection, estimation, service, recordings) is the message `verbatim`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from typing import TypeAlias, Union
+
+import yaml
+
+Value: TypeAlias = Union[str, int, float, "Message", tuple[str, ...], tuple["Message", ...]]
+"""Number, name, message, or several names or messages."""
+
+
+@dataclass(frozen=True)
+class Message:
+    """A message to the operator.
+
+    Attributes
+    ----------
+    key : str
+        In the catalogue.
+    values : mapping of str to Value
+        For the placeholders of the text.
+    """
+
+    key: str
+    values: Mapping[str, Value]
+
+
+def message(key: str, /, **values: Value) -> Message:
+    """Return a message."""
+    return Message(key, values)
+
+
+def verbatim(text: str) -> Message:
+    """Return a text that is in no catalogue as a message."""
+    return message("verbatim", text=text)
+
+
+def english(what: Message) -> str:
+    """Return the English text of a message."""
+    return _render(what, catalogue("en"))
+
+
+@cache
+def catalogue(language: str) -> Mapping[str, str]:
+    """Return the texts of a language by key: ``en``."""
+    content = resources.files(__name__).joinpath(f"{language}.yaml").read_bytes()
+    texts: dict[str, str] = yaml.safe_load(content)
+    return texts
+
+
+def _render(what: Message, texts: Mapping[str, str]) -> str:
+    def shown(value: Value) -> str | int | float:
+        if isinstance(value, Message):
+            return _render(value, texts)
+        if isinstance(value, tuple):
+            return texts["separator"].join(str(shown(part)) for part in value)
+        return value
+
+    return texts[what.key].format(**{name: shown(value) for name, value in what.values.items()})

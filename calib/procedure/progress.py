@@ -1,0 +1,135 @@
+"""State that the phases of the procedure share."""
+
+from dataclasses import dataclass, field
+
+from calib.detection.blocks import Block
+from calib.detection.tracking import AttitudeTracker, StillnessDetector
+from calib.procedure.attempt import Attempt
+from calib.procedure.events import Accepted, Conditions, Event, NavigationLog, Rejected, Restarted
+from calib.procedure.messages import Message, message
+from calib.procedure.prompts import StepObservation
+from calib.procedure.schema import Procedure, Step
+from calib.procedure.transitions import Outcome
+from imudrv.calibration import Calibration
+from imudrv.nav.attitude import Quaternion, conjugate, turn
+from imudrv.nav.mechanisation import Navigator
+from imudrv.site import Site
+
+
+@dataclass
+class Progress:
+    """State that the phases of the procedure share.
+
+    Attributes
+    ----------
+    procedure, site, calibration, interval_s, hands_free
+        See `calib.procedure.engine.Engine`.
+    attitude, stillness
+        Trackers, fed with every block.
+    accepted : dict of str to Accepted
+        Accepted steps, by id.
+    attempts : dict of str to int
+        Number of the latest attempt, by step id.
+    index : int
+        Of the current step.
+    attempt : Attempt
+        The current one.
+    skipped : set of str
+        Ids of skipped steps.
+    logs : list of NavigationLog
+        Logs of the accepted runs.
+    events : list of Event
+        Events that were not handed out yet.
+    reasons : tuple of Message
+        Latest reasons of a rejection or a restart.
+    bells : int
+        See `View`.
+    status : Conditions
+        Latest status of the unit.
+    flags, counter : int
+        Of the newest block.
+    elapsed_s : float
+        Time in the current phase.
+    """
+
+    procedure: Procedure
+    site: Site
+    calibration: Calibration
+    interval_s: float
+    hands_free: bool
+    attitude: AttitudeTracker
+    stillness: StillnessDetector
+    accepted: dict[str, Accepted]
+    attempts: dict[str, int]
+    index: int = 0
+    attempt: Attempt = field(default_factory=Attempt)
+    skipped: set[str] = field(default_factory=set)
+    logs: list[NavigationLog] = field(default_factory=list)
+    events: list[Event] = field(default_factory=list)
+    reasons: tuple[Message, ...] = ()
+    bells: int = 0
+    status: Conditions = field(default_factory=Conditions)
+    flags: int = 0
+    counter: int = -1
+    elapsed_s: float = 0.0
+
+    @property
+    def step(self) -> Step:
+        """Current step."""
+        return self.procedure.steps[self.index]
+
+    @property
+    def number(self) -> int:
+        """Number of the current attempt at the current step."""
+        return self.attempts.get(self.step.id, 0)
+
+    @property
+    def observation(self) -> StepObservation:
+        """Sensors against the current step."""
+        return StepObservation(
+            self.step, self.procedure.limits, self.attitude, self.stillness, self.flags, self.status.faults
+        )
+
+    def remaining(self) -> int | None:
+        """Index of the first step that is neither accepted nor skipped."""
+        done = self.accepted.keys() | self.skipped
+        return next((k for k, step in enumerate(self.procedure.steps) if step.id not in done), None)
+
+    def advance(self) -> Outcome:
+        """Go to the next step, if one remains."""
+        index = self.remaining()
+        if index is None:
+            return Outcome.COMPLETED
+        self.index = index
+        return Outcome.NEXT_STEP
+
+    def trouble(self, block: Block) -> Message | None:
+        """Return why the samples of a block cannot be used."""
+        if block.restarted:
+            return message("unit_restarted")
+        return message("samples_missing", missing=block.missing) if block.hole else self.observation.unfit
+
+    def disturbance(self, block: Block) -> Message | None:
+        """Return why a block is not one of a rest."""
+        moved = message("moved", motion=self.stillness.why) if self.stillness.moving else None
+        return self.trouble(block) or moved
+
+    def navigate(self, q_nb: Quaternion) -> None:
+        """Start the navigation log of the attempt at rest, with this attitude."""
+        navigator = Navigator.from_site(self.site, q_nb, C_ba=self.calibration.accelerometer.C_ba_array)
+        self.attempt.navigate(navigator, turn(conjugate(q_nb), (0.0, 0.0, 1.0)))
+
+    def restart(self, *reasons: Message) -> Outcome:
+        """Report that the alignment has to start again."""
+        self.events.append(Restarted(self.step.id, self.number, reasons, self.counter))
+        self.bells += 1
+        self.reasons = reasons
+        return Outcome.DISTURBED
+
+    def reject(self, *reasons: Message) -> Outcome:
+        """Report that the attempt is rejected, and drop its evidence."""
+        self.events.append(Rejected(self.step.id, self.number, reasons, self.counter))
+        self.bells += 1
+        self.reasons = reasons
+        self.attempt = Attempt()
+        return Outcome.REJECTED

@@ -1,0 +1,91 @@
+"""Messages to the operator: every key is in every catalogue, with the values that the code gives."""
+
+import ast
+import json
+from collections.abc import Iterator
+from dataclasses import asdict
+from importlib import resources
+from pathlib import Path
+from string import Formatter
+
+import pytest
+
+import calib
+from calib.procedure.events import Rejected
+from calib.procedure.messages import Message, catalogue, english, message, verbatim
+
+LANGUAGES = [
+    path.name.removesuffix(".yaml")
+    for path in resources.files("calib.procedure.messages").iterdir()
+    if path.name.endswith(".yaml")
+]
+HEADLINE = 38  # characters: what a screen of 80 columns has in letters of three rows
+
+
+def placeholders(text: str) -> set[str]:
+    return {name for _, name, _, _ in Formatter().parse(text) if name}
+
+
+def used() -> Iterator[tuple[str, set[str]]]:
+    """Key and value names of each message that the code makes."""
+    for path in Path(calib.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "message":
+                (key,) = node.args
+                assert isinstance(key, ast.Constant), f"{path}:{node.lineno}: the key has to be a literal"
+                yield str(key.value), {str(keyword.arg) for keyword in node.keywords}
+
+
+@pytest.mark.parametrize("language", LANGUAGES)
+def test_the_code_and_every_catalogue_have_the_same_keys_with_the_same_values(language: str) -> None:
+    texts = catalogue(language)
+    calls = list(used())
+
+    assert {key for key, _ in calls} | {"separator"} == set(texts)
+    for key, names in calls:
+        assert placeholders(texts[key]) == names, key
+
+
+def test_english_is_among_the_languages() -> None:
+    assert "en" in LANGUAGES
+
+
+def test_values_are_formatted_and_messages_within_a_message_are_rendered() -> None:
+    cause = message("samples_missing", missing=700)
+    assert (
+        english(message("alignment_interrupted", elapsed_s=8.4, cause=cause))
+        == "alignment interrupted after 8 s: 700 samples missing"
+    )
+    assert english(message("fault", faults=("power", "dither"))) == "the unit reports a fault: power, dither"
+    readings = tuple(
+        message("accelerometer_reads", axis=axis, measured_m_s2=1.0, expected_m_s2=-9.8) for axis in "XY"
+    )
+    assert english(message("axis_fault", readings=readings, cause=message("unexplained"))).startswith(
+        "accelerometer X reads +1.00 m/s^2, expected -9.80, accelerometer Y reads +1.00 m/s^2, "
+    )
+
+
+def test_text_from_elsewhere_is_shown_as_it_is() -> None:
+    assert english(verbatim("{not a placeholder} 5 % +- 1")) == "{not a placeholder} 5 % +- 1"
+
+
+def test_headlines_are_readable_from_afar_with_the_longest_values() -> None:
+    longest = {"side": "-X", "angle_deg": 180.0, "turn_deg": -180, "step": 100, "steps": 100}
+    for key, text in catalogue("en").items():
+        if "".join(part for part, *_ in Formatter().parse(text)).isupper():
+            shown = english(Message(key, {name: longest[name] for name in placeholders(text)}))
+            assert len(shown) <= HEADLINE, shown
+            assert shown.isascii()
+
+
+def test_an_event_goes_into_a_journal_with_keys_and_numbers() -> None:
+    reason = message("rest_interrupted", elapsed_s=1.5, rest_s=15.0, cause=message("unit_restarted"))
+
+    entry = json.loads(json.dumps(asdict(Rejected("z", 1, (reason,), 5))))
+
+    assert entry["reasons"] == [
+        {
+            "key": "rest_interrupted",
+            "values": {"elapsed_s": 1.5, "rest_s": 15.0, "cause": {"key": "unit_restarted", "values": {}}},
+        }
+    ]
