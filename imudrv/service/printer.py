@@ -38,12 +38,13 @@ class Printer:
 
     def __init__(self, stream: TextIO | None) -> None:
         self._name, self._encoding = os.devnull, "utf-8"
-        # The descriptor, since at exit Python flushes the stream and waits for a thread that writes to it.
+        # A descriptor, since at exit Python flushes the stream and waits for a thread that writes to it; its
+        # own, since nobody else closes that.
         if stream is None:
             self._fd = os.open(os.devnull, os.O_WRONLY)
         else:
             self._name, self._encoding = str(stream.name).strip("<>"), stream.encoding
-            self._fd = stream.fileno()
+            self._fd = os.dup(stream.fileno())
         self._failure = ""
         self._writing_since_s: float | None = None
         self._overflowed = self._unwritten = 0  # each counted by one thread, so nothing is locked
@@ -112,6 +113,7 @@ class Printer:
                 line = f"(lost lines: {lost - reported})\n{line}"
             if self._write(f"{line}\n".encode(self._encoding, "backslashreplace")):
                 reported = lost
+        os.close(self._fd)
 
     def _write(self, data: bytes) -> bool:
         """Write a line, however long that takes; return whether it was written."""
