@@ -72,8 +72,8 @@ def test_a_log_of_two_units_is_refused_by_every_command_however_late_the_second_
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("imudrv.capture.CHUNK_BYTES", 4096)  # the log is read in 70 pieces
-    main, before, behind = COMMANDS[command]
-    assert main([*before, log, *behind]) == 2
+    main, before, after = COMMANDS[command]
+    assert main([*before, log, *after]) == 2
     assert capsys.readouterr().err == f"error: {BOTH.replace('two.log', log)}--channel can0\n"
     assert not list(here.glob("*out.*"))
 
@@ -88,9 +88,9 @@ def test_the_chosen_unit_comes_out_as_from_a_log_of_its_own(
     capsys.readouterr()
     assert imudrv(["decode", "two.log", *PROFILE, "--channel", channel, "-o", "out.npz"]) == 0
     other = {"can0": "can1", "can1": "can0"}[channel]
-    told = capsys.readouterr().out
-    assert "3000 samples by the counter = 3000 good" in told
-    assert f"left out: 6060 messages of channel {other}" in told
+    message = capsys.readouterr().out
+    assert "3000 samples by the counter = 3000 good" in message
+    assert f"left out: 6060 messages of channel {other}" in message
     with np.load("out.npz") as archive:
         for name, column in alone.items():
             np.testing.assert_array_equal(archive[name], column)
@@ -117,10 +117,10 @@ def test_the_shipped_log_of_two_units_gives_each_of_them_as_it_was(
 def test_a_channel_that_the_log_does_not_have_is_refused_with_those_it_has(
     command: str, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    main, before, behind = COMMANDS[command]
-    assert main([*before, "two.log", *behind, "--channel", "can7"]) == 2
-    told = capsys.readouterr().err
-    assert told == "error: two.log: expected messages of CAN channel 'can7', got those of can0 and can1\n"
+    main, before, after = COMMANDS[command]
+    assert main([*before, "two.log", *after, "--channel", "can7"]) == 2
+    message = capsys.readouterr().err
+    assert message == "error: two.log: expected messages of CAN channel 'can7', got those of can0 and can1\n"
     assert not list(here.glob("*out.*"))
 
 
@@ -135,16 +135,16 @@ def test_a_channel_of_what_is_no_can_log_is_refused(
     if not Path("unit.mcap").exists():
         subprocess.run([sys.executable, "-m", "imudrv", *service], check=True, timeout=120)
     capsys.readouterr()
-    main, before, behind = COMMANDS[command]
+    main, before, after = COMMANDS[command]
     for name, profile, what in (
         ("unit.raw", "imu50-rs422", "a capture of imu50-rs422"),
         ("unit.mcap", "imu50-can", "a recording"),
     ):
-        arguments = [profile if a == "imu50-can" else a for a in behind]
+        arguments = [profile if a == "imu50-can" else a for a in after]
         assert main([*before, name, *arguments, "--channel", "can0"]) == 2
-        told = capsys.readouterr().err
+        message = capsys.readouterr().err
         expected = f"error: {name}: --channel can0: expected a candump log, got {what}; leave --channel out\n"
-        assert told == expected
+        assert message == expected
 
 
 def test_a_replay_of_two_units_is_refused_before_a_sample_is_served(here: Path) -> None:

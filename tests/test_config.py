@@ -170,7 +170,7 @@ def test_a_document_may_hold_a_time_as_such() -> None:
 # What is refused, and in which words
 
 
-def test_all_faults_are_told_at_once(file: Path) -> None:
+def test_all_faults_are_reported_at_once(file: Path) -> None:
     text = (
         "format: test-settings\nversion: 1\nrate_hz: -1\ncount: many\naxes: [[1, 0, 0], [0, 1], 5]\nnane: x\n"
     )
@@ -243,7 +243,7 @@ def test_an_unknown_key_like_no_other_brings_all_known_ones() -> None:
     assert fault(lines=[{"baudrate": 50, "zz": 1}]) == "lines[0].zz: unknown key; known are baudrate, parity"
 
 
-def test_of_alternative_sections_the_one_that_fits_best_is_told() -> None:
+def test_of_alternative_sections_the_one_that_fits_best_is_reported() -> None:
     assert fault(line={"baudrate": 5}) == "line.baudrate: expected at least 50, got 5"
     assert fault(line={"bitrate": "fast"}) == "line.bitrate: expected a whole number, got text 'fast'"
     assert fault(line=5) == "line: expected a mapping (key: value), got 5"
@@ -251,17 +251,17 @@ def test_of_alternative_sections_the_one_that_fits_best_is_told() -> None:
 
 
 @pytest.mark.parametrize("version", [2, True, 1.0, "1", None])
-def test_another_version_is_told_alone(version: object) -> None:
+def test_another_version_is_the_only_fault_reported(version: object) -> None:
     (only,) = faults_of({"format": "test-settings", "version": version, "unheard": 1})
     assert only.startswith("version: expected 1, got ")
 
 
-def test_another_format_is_told_alone() -> None:
+def test_another_format_is_the_only_fault_reported() -> None:
     document = {"format": "imu50-site", "version": 1, "latitude_deg": 5}
     assert faults_of(document) == ("format: expected test-settings, got text 'imu50-site'",)
 
 
-def test_a_missing_header_is_told() -> None:
+def test_a_missing_header_is_reported() -> None:
     assert faults_of({}) == ("format: missing; add it", "version: missing; add it")
 
 
@@ -269,7 +269,7 @@ def test_a_missing_header_is_told() -> None:
     ("text", "came"),
     [("", "nothing"), ("# all quiet", "nothing"), ("5", "5"), ("[a]", "a list of 1"), ("a", "text 'a'")],
 )
-def test_a_file_that_is_no_mapping_is_told(file: Path, text: str, came: str) -> None:
+def test_a_file_that_is_no_mapping_is_reported(file: Path, text: str, came: str) -> None:
     assert f"1 fault\n  expected a mapping (key: value), got {came}" in faults_in(file, text)
 
 
@@ -295,7 +295,7 @@ def test_a_syntax_error_tells_line_and_column(file: Path) -> None:
     assert "1 fault\n  line 3, column 6: expected YAML, got: " in faults_in(file, "a: 1\nb: [1,\nc: 2]]\n")
 
 
-def test_repeated_keys_are_all_told_with_their_lines(file: Path) -> None:
+def test_repeated_keys_are_all_reported_with_their_lines(file: Path) -> None:
     message = faults_in(file, "a: 1\nb: {c: 1, c: 2}\na: 3\n")
     assert "line 2, column 11: expected each key once, got c again; keep one" in message
     assert "line 3, column 1: expected each key once, got a again; keep one" in message
@@ -344,7 +344,7 @@ def test_a_second_document_is_refused(file: Path) -> None:
     assert "line 2, column 1: expected one document, got a second one" in faults_in(file, "a: 1\n---\nb: 2\n")
 
 
-def test_bytes_that_are_no_utf_8_are_told_with_their_line(file: Path) -> None:
+def test_bytes_that_are_no_utf_8_are_reported_with_their_line(file: Path) -> None:
     assert "line 2: expected UTF-8 text, got the byte 0xe9" in faults_in(file, b"a: 1\nname: caf\xe9\n")
 
 
@@ -373,7 +373,7 @@ def test_any_bytes_give_a_model_or_our_error(content: bytes) -> None:
 # Files that cannot be read
 
 
-def test_a_missing_file_is_told_in_plain_words(file: Path) -> None:
+def test_a_missing_file_is_reported_in_plain_words(file: Path) -> None:
     for act in (lambda: read(file, Settings), lambda: kind(file), lambda: sha256(file)):
         with pytest.raises(
             InputError, match=r"settings\.yaml: expected a file, there is none; check the path"
@@ -394,7 +394,7 @@ def test_a_pipe_does_not_hang(tmp_path: Path) -> None:
         read(tmp_path / "pipe", Settings)
 
 
-def test_a_file_without_permission_is_told(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_without_permission_is_reported(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file.write_text("a: 1")
 
     def refuse(*_: object) -> None:  # root, who runs tests in containers, may read anything
@@ -406,7 +406,7 @@ def test_a_file_without_permission_is_told(file: Path, monkeypatch: pytest.Monke
 
 
 @pytest.mark.parametrize("path", ["a\0b", "x" * 5000, "/dev/null/x"])
-def test_a_path_that_cannot_be_is_told(path: str) -> None:
+def test_a_path_that_cannot_be_is_reported(path: str) -> None:
     with pytest.raises(InputError, match="cannot be read: "):
         read(path, Settings)
     with pytest.raises(InputError, match="cannot be written: "):
@@ -545,7 +545,7 @@ def test_a_written_file_reads_well(file: Path) -> None:
     )
 
 
-def test_a_value_that_stands_twice_is_written_twice(file: Path) -> None:
+def test_a_value_that_occurs_twice_is_written_twice(file: Path) -> None:
     row, when = [1, 2], datetime(2026, 11, 22, 10, tzinfo=UTC)
     write(file, {"content": {"a": row, "b": row, "c": when, "d": when}})
     time = "2026-11-22T10:00:00Z"
@@ -599,18 +599,18 @@ def test_the_contents_are_on_the_disk_before_the_name_and_then_the_name(
     steps: list[str] = []
     fsync, replace = os.fsync, Path.replace
 
-    def fsync_told(fd: int) -> None:
+    def fsync_recorded(fd: int) -> None:
         steps.append("fsync folder" if os.path.isdir(f"/proc/self/fd/{fd}") else "fsync file")
         fsync(fd)
 
-    def replace_told(path: Path, target: Path) -> Path:
+    def replace_recorded(path: Path, target: Path) -> Path:
         steps.append("rename")
         assert path.read_text() == "bitrate: 1\n"
         assert path.parent == target.parent
         return replace(path, target)
 
-    monkeypatch.setattr(os, "fsync", fsync_told)
-    monkeypatch.setattr(Path, "replace", replace_told)
+    monkeypatch.setattr(os, "fsync", fsync_recorded)
+    monkeypatch.setattr(Path, "replace", replace_recorded)
     write(file, Bus(bitrate=1))
     assert steps == ["fsync file", "rename", "fsync folder"]
 
@@ -622,7 +622,7 @@ def test_a_written_file_has_the_permissions_of_any_new_file(file: Path) -> None:
     assert file.stat().st_mode == other.stat().st_mode
 
 
-def test_a_missing_folder_is_told(file: Path) -> None:
+def test_a_missing_folder_is_reported(file: Path) -> None:
     with pytest.raises(InputError, match=r"expected the folder .*nowhere, there is none; make it first"):
         write(file.parent / "nowhere" / "x.yaml", Bus(bitrate=1))
 

@@ -52,7 +52,7 @@ COMMANDS: dict[str, tuple[Callable[[list[str]], int], str]] = {
     "import-arms": (calib, "import-arms arms.m --from psins --calibration unit.csv -o OUT"),
 }
 SUFFIX = {"decode": ".csv", "compensate": ".csv", "truth": ".npz"}
-"""Of the outputs that have to have one."""
+"""Suffixes of the outputs that need one."""
 INPUTS = ("run.csv", "run.mcap", "short.yaml", "own.csv", "unit.csv", "site.yaml", "arms.m")
 
 
@@ -127,8 +127,8 @@ def test_what_is_no_file_is_refused_and_stays_what_it_is(
         os.symlink(name, output)
     before, files = os.stat(name), set(os.listdir())
     assert run(command, output) == 2
-    told = capsys.readouterr().err
-    assert told == f"error: {output}: expected a file, got a {kind}; choose another name\n"
+    message = capsys.readouterr().err
+    assert message == f"error: {output}: expected a file, got a {kind}; choose another name\n"
     after = os.stat(name)
     assert (after.st_ino, after.st_mode, after.st_rdev) == (before.st_ino, before.st_mode, before.st_rdev)
     assert set(os.listdir()) == files
@@ -152,8 +152,8 @@ def test_an_output_that_is_an_input_is_refused_under_whatever_name(
         output = f"link{SUFFIX.get(command, '')}"
         (os.link if way == "hard link" else os.symlink)(name, output)
     assert run(command, output) == 2
-    told = capsys.readouterr().err
-    assert told == (
+    message = capsys.readouterr().err
+    assert message == (
         f"error: {output}: expected an output apart from its input {name}, got the same file; "
         "choose another name\n"
     )
@@ -184,6 +184,12 @@ def test_a_symbolic_link_is_followed(command: str, there: bool, here: Path) -> N
         assert read_calibration(target).size_effect.gauge == "x"  # type: ignore[union-attr]
         kept = [path for path in target.parent.iterdir() if path != target]
         assert [path.read_bytes() for path in kept] == [before] * there
+
+
+def test_an_output_in_a_missing_folder_is_refused_with_the_name_of_the_folder(here: Path) -> None:
+    expected = "no/it: cannot be written: expected the folder no, there is none; make it first"
+    with pytest.raises(InputError, match=expected), atomic_write(Path("no/it")):
+        pass
 
 
 def test_a_link_that_leads_in_a_circle_is_refused(here: Path) -> None:
@@ -236,13 +242,13 @@ def test_what_makes_no_sense_on_standard_output_is_refused_in_a_line(
 ) -> None:
     files = set(os.listdir())
     assert run(command, "-") == 2
-    told = capsys.readouterr()
-    assert told.out == ""
-    assert told.err == "error: -: expected a file, for this output cannot go to standard output\n"
+    message = capsys.readouterr()
+    assert message.out == ""
+    assert message.err == "error: -: expected a file, for this output cannot go to standard output\n"
     assert set(os.listdir()) == files
 
 
-def test_a_full_standard_output_is_told_and_one_that_its_reader_leaves_is_no_fault(here: Path) -> None:
+def test_a_full_standard_output_is_reported_and_one_that_its_reader_leaves_is_no_fault(here: Path) -> None:
     command = process("decode run.csv --profile own.csv -o -")
     with open("/dev/full", "wb") as full:
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, timeout=120, check=False)

@@ -1,4 +1,4 @@
-"""Profiles as data: the shipped ones against the ICD, invented ones without code, faults told at once."""
+"""Profiles as data: the shipped ones against the ICD, invented ones without code, all faults at once."""
 
 import json
 from pathlib import Path
@@ -153,8 +153,8 @@ def test_a_profile_tells_all_its_faults_at_once(tmp_path: Path) -> None:
     document = stream_profile(byte_order="middle", sample_rate_hz=0, colour="red")
     with pytest.raises(FaultyFileError) as caught:
         profiles.load(written(tmp_path, document))
-    told = " ".join(caught.value.faults)
-    assert all(place in told for place in ("byte_order", "sample_rate_hz", "colour"))
+    message = " ".join(caught.value.faults)
+    assert all(place in message for place in ("byte_order", "sample_rate_hz", "colour"))
 
 
 @pytest.mark.parametrize(

@@ -162,7 +162,7 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("opcode", [1, 3, 4, 5, 9, 12])
-def test_a_record_of_absurd_length_is_not_read_but_told_with_its_place(
+def test_a_record_of_absurd_length_is_not_read_but_reported_with_its_place(
     recorded: Path, tmp_path: Path, opcode: int
 ) -> None:
     data = bytearray(recorded.read_bytes())
@@ -184,7 +184,7 @@ def test_a_chunk_that_unpacks_to_more_than_it_says_is_refused(recorded: Path, tm
         return struct.pack("<BQ", 6, len(body)) + body
 
     zeros = zstandard.compress(bytes(1 << 26))
-    for record_, told in (
+    for record_, message in (
         (chunk(b"zstd", 1000, zeros), "length and check are right"),
         (chunk(b"zstd", 1 << 40, zeros), "at most"),
         (chunk(b"zstd", 1000, bomb), "unpacks"),
@@ -194,11 +194,11 @@ def test_a_chunk_that_unpacks_to_more_than_it_says_is_refused(recorded: Path, tm
         (chunk(b"", len(chunk(b"", 0, b"")), chunk(b"", 0, b"")), "no chunk inside of a chunk"),
     ):
         path.write_bytes(recorded.read_bytes()[:8] + record_)
-        with pytest.raises(InputError, match=rf"at byte 8: .*{told}"):
+        with pytest.raises(InputError, match=rf"at byte 8: .*{message}"):
             list(Recording(path).arrivals())
 
 
-def test_an_attachment_that_was_changed_is_told(recorded: Path, tmp_path: Path) -> None:
+def test_an_attachment_that_was_changed_is_reported(recorded: Path, tmp_path: Path) -> None:
     data = bytearray(recorded.read_bytes())
     at = places_of(data, 9)[0]
     data[at + 200] ^= 1
@@ -212,7 +212,9 @@ def test_an_attachment_that_was_changed_is_told(recorded: Path, tmp_path: Path) 
 
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_whatever_is_damaged_it_is_read_or_told(recorded: Path, tmp_path: Path, data: st.DataObject) -> None:
+def test_whatever_is_damaged_it_is_read_or_reported(
+    recorded: Path, tmp_path: Path, data: st.DataObject
+) -> None:
     content = bytearray(recorded.read_bytes())
     for _ in range(data.draw(st.integers(1, 4))):
         content[data.draw(st.integers(8, len(content) - 1))] = data.draw(st.integers(0, 255))

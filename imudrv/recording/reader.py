@@ -110,11 +110,10 @@ class Recording:
     @property
     def profile_text(self) -> str:
         """Text of the profile file."""
-        found = next(self._attachments(PROFILE), None)
-        if found is None:
-            why = "it was cut before it, there is nothing in it" if self.cut else "it is not from this driver"
-            raise InputError(f"{self.path}: expected a recording with its {PROFILE}, got none: {why}")
-        return found[1]
+        for _, text in self._attachments(PROFILE):
+            return text
+        why = "it was cut before it, there is nothing in it" if self.cut else "it is not from this driver"
+        raise InputError(f"{self.path}: expected a recording with its {PROFILE}, got none: {why}")
 
     @property
     def profile(self) -> Profile:
@@ -124,16 +123,12 @@ class Recording:
     @property
     def calibration_text(self) -> str | None:
         """Text of the first calibration file; None without one."""
-        found = next(self._attachments(CALIBRATION), None)
-        return None if found is None else found[1]
+        return next((text for _, text in self._attachments(CALIBRATION)), None)
 
     @property
     def calibration(self) -> Calibration | None:
         """First calibration; None without one."""
-        text = self.calibration_text
-        if text is None:
-            return None
-        return settings_file.parse_text(text.encode(), Calibration, f"{self.path}: {CALIBRATION}")
+        return next((calibration for _, calibration in self.calibrations()), None)
 
     def calibrations(self) -> Iterator[tuple[int, Calibration]]:
         """Yield each calibration with the host time, ns, after which it holds."""
