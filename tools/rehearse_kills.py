@@ -2,10 +2,10 @@
 
     python tools/rehearse_kills.py [--kills 30] [--seed 1] [FOLDER]
 
-Every third time it runs at a terminal that takes no output, as after Ctrl-S.
+Every third run has a terminal that accepts no output, as after Ctrl-S.
 
-At the end the session has to verify, no accepted step may have been asked again, no sample logged twice, and
-the result must be that of an undisturbed rehearsal within three sigma of their difference.
+At the end the session must verify, no accepted step may have been repeated, no sample logged twice, and the
+result must agree with that of an undisturbed rehearsal within three sigma of their difference.
 """
 
 import argparse
@@ -29,15 +29,15 @@ from imudrv.units import MM
 
 RUN: Final = (
     "import sys; from pathlib import Path; from rich.console import Console; "
-    "from calib.bench.run import run; "
-    "run(folder=Path(sys.argv[1]), rehearse=True, speed='max', console=Console())"
+    "from calib.bench.run import RunOptions, run; "
+    "run(RunOptions(Path(sys.argv[1]), rehearse=True, speed='max'), Console())"
 )
 PAUSE_S: Final = (3.0, 25.0)
-"""A process lives so long at least, for it takes a while to start, and at most."""
+"""Shortest and longest life of a process; it takes a while to start."""
 
 
 def main() -> int:
-    """Run it."""
+    """Run the rehearsals and print the faults."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folder", type=Path, nargs="?", help="where the two sessions go")
     parser.add_argument("--kills", type=int, default=30)
@@ -70,7 +70,7 @@ def main() -> int:
 
 
 def rehearse(folder: Path, longest_s: float | None = None, is_stopped: bool = False) -> bool:
-    """Rehearse, or go on with it, into a log or a stopped terminal; whether it came to its end in time."""
+    """Begin or resume a rehearsal, into a log or a stopped terminal; return whether it ended in time."""
     with ExitStack() as opened:
         output: Any = opened.enter_context(open(f"{folder}.log", "a"))
         if is_stopped:
@@ -98,7 +98,7 @@ def rehearse(folder: Path, longest_s: float | None = None, is_stopped: bool = Fa
 
 
 def check(folder: Path, undisturbed: Path) -> list[str]:
-    """What is wrong with a session that was disturbed."""
+    """Return the faults of a disturbed session."""
     faults = list(verify(folder).faults)
     done: set[str] = set()
     for entry in journal(folder):
@@ -122,19 +122,19 @@ def check(folder: Path, undisturbed: Path) -> list[str]:
 
 
 def journal(folder: Path) -> list[dict[str, Any]]:
-    """Whole lines of a session's journal."""
+    """Return the complete lines of a session's journal."""
     path = folder / "journal.jsonl"
     lines = []
     for line in path.read_text(errors="replace").splitlines() if path.exists() else []:
         try:
             lines.append(json.loads(line))
         except ValueError:
-            continue  # what a kill left
+            continue  # a partial line after a kill
     return lines
 
 
 def size_effect(folder: Path) -> SizeEffect:
-    """Of a session's result."""
+    """Return the size effect of a session's result."""
     found = read_calibration(folder / "certificate.yaml").size_effect
     assert found is not None
     return found

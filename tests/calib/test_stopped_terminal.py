@@ -10,7 +10,7 @@ from pathlib import Path
 from threading import Event, Thread
 from typing import Any
 
-from calib.bench.session import JOURNAL
+from calib.bench.state import JOURNAL
 from calib.bench.verify import verify
 
 PROCEDURE = """

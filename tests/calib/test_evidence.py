@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from calib.bench.evidence import Attempt, require_covered, uncovered
+from calib.bench.evidence import require_covered, uncovered
+from calib.bench.state import Attempt
 from calib.procedure.schema import Step
 from imudrv import profiles
 from imudrv.errors import InputError
