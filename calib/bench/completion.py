@@ -96,8 +96,7 @@ def activate(session: Session, certificate: Calibration) -> None:
 def verification_residual(session: Session, certificate: Calibration) -> ResidualVelocity:
     """Return the residual velocity after the verification rotation."""
     procedure = verification(session.procedure())
-    attempt = session.attempt(procedure.steps[0], session.accepted[VERIFICATION])
-    return residual_velocity(procedure, attempt, certificate, session.site())
+    return residual_velocity(procedure, session.attempts()[VERIFICATION], certificate, session.site())
 
 
 def write_report(session: Session, result: Result, residual: ResidualVelocity | None) -> None:

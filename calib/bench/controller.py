@@ -139,7 +139,8 @@ class SessionController:
             session.append(last)
         self._screen.print("Computing the lever arms from the recordings ...")
         result = session_result(session)
-        self._queue.require_open()  # nothing is decided after Ctrl-C
+        if self._sink.is_closed:
+            raise ServiceEndedError  # nothing is decided after Ctrl-C
         if not self._is_accepted(result):
             self.outcome = f"rejected; certificate unchanged: {session.plan.certificate.path}"
             return

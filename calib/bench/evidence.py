@@ -86,8 +86,9 @@ class _DecodedRecording(NamedTuple):
 def identify_session(session: SessionState) -> Result:
     """Identify the lever arms from the accepted steps of a session; see `identify`."""
     procedure = session.procedure()
-    attempts = [attempt for attempt in session.attempts() if attempt.step.id != VERIFICATION]
-    return identify(procedure, attempts, session.initial_calibration(), session.site())
+    attempts = session.attempts()
+    attempts.pop(VERIFICATION, None)
+    return identify(procedure, list(attempts.values()), session.initial_calibration(), session.site())
 
 
 def identify(

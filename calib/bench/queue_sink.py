@@ -133,8 +133,3 @@ class QueueReader:
             wait([done], CLOSING_S)
         if done.done() and not done.cancelled():
             done.result()
-
-    def require_open(self) -> None:
-        """Raise `ServiceEndedError` if the service has ended, even if samples are left."""
-        if self._queue.is_closed:
-            raise ServiceEndedError

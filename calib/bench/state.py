@@ -152,24 +152,14 @@ class SessionState:
             read_calibration(self.folder / INITIAL_CERTIFICATE), certificate.path.name, certificate.sha256
         )
 
-    def attempts(self) -> list[Attempt]:
-        """Return the accepted attempts, in the order of the procedure; that at the verification is last."""
+    def attempts(self) -> dict[str, Attempt]:
+        """Return the accepted attempts by step id, in the order of the procedure, the verification last."""
         procedure, accepted = self.procedure(), self.accepted
-        return [
-            self.attempt(step, accepted[step.id])
+        return {
+            step.id: Attempt(step, self.folder / a.recording, a.first_counter, a.last_counter, a.samples)
             for step in (*procedure.steps, *verification(procedure).steps)
-            if step.id in accepted
-        ]
-
-    def attempt(self, step: Step, accepted: AcceptedStep) -> Attempt:
-        """Return an accepted attempt at a step with its recording."""
-        return Attempt(
-            step,
-            self.folder / accepted.recording,
-            accepted.first_counter,
-            accepted.last_counter,
-            accepted.samples,
-        )
+            if (a := accepted.get(step.id)) is not None
+        }
 
 
 def require_session(folder: Path) -> None:

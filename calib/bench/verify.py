@@ -30,8 +30,8 @@ class Verified(NamedTuple):
     notes: tuple[str, ...]
 
     def __str__(self) -> str:
-        """Return one line per fault and note."""
-        return "\n".join([*(f"fault: {fault}" for fault in self.faults), *self.notes])
+        """Return one line per note and fault."""
+        return "\n".join([*self.notes, *(f"fault: {fault}" for fault in self.faults)])
 
 
 def verify(folder: Path) -> Verified:
@@ -92,7 +92,7 @@ def faulty_files(session: SessionState) -> list[str]:
 def uncovered_steps(session: SessionState) -> list[str]:
     """Return the accepted steps whose recordings lack a part of the evidence, one line each."""
     faults = []
-    for attempt in session.attempts():
+    for attempt in session.attempts().values():
         try:
             require_covered(attempt)
         except InputError as error:

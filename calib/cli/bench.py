@@ -28,6 +28,6 @@ def run_session(arguments: argparse.Namespace) -> int:
 
 def run_verify(arguments: argparse.Namespace) -> int:
     """Verify a session."""
-    faults, notes = verify(arguments.session)
-    print("\n".join([*notes, *faults]))
-    return BAD_INPUT if faults else OK
+    verified = verify(arguments.session)
+    print(verified)
+    return BAD_INPUT if verified.faults else OK

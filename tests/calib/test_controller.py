@@ -1,4 +1,4 @@
-"""The worker between engine, session and operator, with samples from a queue instead of a unit."""
+"""Controller of a session, with samples from a queue instead of a unit."""
 
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -69,7 +69,7 @@ PROCEDURE = settings_file.parse_text(ONE.encode(), Procedure, "one.yaml")
 
 
 class Line:
-    """In the place of the service, whose unit has sent everything already: records it from its history."""
+    """Stand-in for the service, whose unit has already sent everything: records from the history."""
 
     def __init__(self, history: History) -> None:
         self.stopped = False
@@ -80,7 +80,7 @@ class Line:
 
     @property
     def port_state(self) -> LineState:
-        """The next state at each look; at last nothing is wrong."""
+        """Next state at each call; without a fault at the end."""
         return self.states.pop(0) if self.states else LineState("streaming")
 
     def publish(self, batch: Batch) -> None:
@@ -111,7 +111,7 @@ class Line:
 
 
 class Typed(Keyboard):
-    """Keys that are pressed once the screen asks for something."""
+    """Keyboard that answers what the screen shows."""
 
     def __init__(self, press: Callable[[str], str] = lambda _: "") -> None:
         super().__init__()
@@ -123,22 +123,22 @@ class Typed(Keyboard):
 
 
 class Shown(OperatorScreen):
-    """A screen that the fingers see at once."""
+    """Screen that the keyboard reads at once."""
 
     def __init__(self, keys: Typed) -> None:
         self.text = StringIO()
         super().__init__(Console(file=self.text, width=200))
-        self._fingers = keys
+        self._typed = keys
 
     def show(self, view: View, question: str = "") -> None:
         super().show(view, question)
         while not self.is_idle:
             sleep(0.001)
-        self._fingers.seen = plain(view, question)
+        self._typed.seen = plain(view, question)
 
 
 def performed(scenario: Scenario) -> list[Batch]:
-    """A technician's samples, in pieces of a fifth of a second."""
+    """Samples of a scenario, in pieces of a fifth of a second."""
     compensator = Compensator(
         coefficients(NOMINAL.model_copy(update={"size_effect": None})),
         LAYOUT,
@@ -185,9 +185,9 @@ def conducted(
     dropped: range = range(0),
     port_states: Sequence[LineState] = (),
 ) -> tuple[SessionController, str]:
-    """Work through items, behind which nothing comes; `stopped`: the service ended before they were taken.
+    """Run the controller over items; `stopped`: the service ended before they were taken.
 
-    All of them have passed before the worker begins: it is as late as it can be. `dropped`: samples that the
+    All items have passed before the controller begins: it is as late as possible. `dropped`: samples that the
     first recording lacks.
     """
     tap, line, keys = QueueSink(None), Line(History(history_bytes)), keys or Typed()
@@ -247,7 +247,7 @@ def test_a_step_is_accepted_once_its_files_are_in(session: Session, batches: lis
     assert verify(session.folder).faults == ()
 
 
-def test_with_an_operator_nothing_goes_on_without_a_key(session: Session, batches: list[Batch]) -> None:
+def test_with_an_operator_nothing_continues_without_a_key(session: Session, batches: list[Batch]) -> None:
     _, text = conducted(session, list(batches), hands_free=False)
     assert "READY: CONFIRM" in text
     assert "align" not in text
@@ -263,7 +263,7 @@ def test_the_operators_key_confirms(
     assert list(session.accepted) == ["z-up"]
 
 
-def test_an_abort_leaves_a_session_to_go_on_with(
+def test_an_aborted_session_can_be_resumed(
     session: Session, batches: list[Batch], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(controllers, "REDRAW_S", 0.0)
@@ -277,7 +277,7 @@ def test_an_abort_leaves_a_session_to_go_on_with(
     assert not session.is_over
 
 
-def test_what_the_service_says_of_the_port_is_shown_and_journaled(
+def test_messages_of_the_service_about_the_port_are_shown_and_journaled(
     session: Session, batches: list[Batch], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(controllers, "REDRAW_S", 0.0)
@@ -321,7 +321,7 @@ def test_a_recording_begins_where_the_engine_asked_for_the_unit_to_be_placed(
 
 
 @pytest.mark.parametrize("history_bytes", [1 << 20, 4 << 20])
-def test_where_the_history_does_not_reach_back_the_step_is_asked_again_with_the_reason(
+def test_a_step_is_repeated_with_the_reason_if_the_history_is_too_short(
     session: Session, batches: list[Batch], history_bytes: int
 ) -> None:
     _, text = conducted(session, list(batches), history_bytes=history_bytes)
@@ -335,7 +335,7 @@ def test_where_the_history_does_not_reach_back_the_step_is_asked_again_with_the_
     assert verify(session.folder).faults == ()
 
 
-def test_a_step_whose_recording_has_a_hole_is_done_again_and_then_counts(session: Session) -> None:
+def test_a_step_with_a_gap_in_its_recording_is_repeated_and_then_accepted(session: Session) -> None:
     pose = ONE[ONE.index("{id") : ONE.index("]")]
     twice = ONE.replace(pose, f"{pose}, {pose.replace('z-up', 'again')}")
     procedure = settings_file.parse_text(twice.encode(), Procedure, "twice.yaml")
@@ -356,7 +356,7 @@ def test_a_key_refers_to_the_view_that_the_operator_sees(
     assert phases(session, Phase.SETTLE) == []
 
 
-def test_evidence_is_whole_though_the_worker_is_held_up_for_as_long_as_a_step_takes(
+def test_evidence_is_complete_even_if_the_worker_is_late_by_a_whole_step(
     session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     done = technician_scenario(PROCEDURE, calibration=NOMINAL)
@@ -372,13 +372,13 @@ def test_evidence_is_whole_though_the_worker_is_held_up_for_as_long_as_a_step_ta
     )
     append, tap, keys = session.append, QueueSink(None), Typed()
 
-    def held_up(entry: Entry) -> None:
+    def delayed_append(entry: Entry) -> None:
         append(entry)
         is_preflight = isinstance(entry, Entered) and entry.phase is Phase.PREFLIGHT
         while is_preflight and tap.state.queued < 70_000:  # its alignment is over
             sleep(0.01)
 
-    monkeypatch.setattr(session, "append", held_up)
+    monkeypatch.setattr(session, "append", delayed_append)
     service = Service(settings, lambda _: None, [tap], history=History())
     conduct = SessionController(
         session, LAYOUT, service, tap, Shown(keys), keys, hands_free=True, begin=lambda _: None
@@ -427,7 +427,7 @@ def test_a_restart_of_the_unit_between_steps_is_noted(
 
 @pytest.fixture
 def found(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A result without recordings to it."""
+    """A result without recordings."""
 
     nothing: Any = None
     monkeypatch.setattr(completion, "identify_session", lambda _: Result(nothing, NOMINAL))
@@ -445,7 +445,7 @@ def test_a_result_that_is_rejected_changes_nothing(
     assert session.plan.certificate.path.read_bytes() == before
 
 
-def test_nothing_is_decided_behind_a_ctrl_c(session: Session, batches: list[Batch], found: None) -> None:
+def test_nothing_is_decided_after_ctrl_c(session: Session, batches: list[Batch], found: None) -> None:
     before = session.plan.certificate.path.read_bytes()
     conduct, _ = conducted(session, list(batches), stopped=True)
     assert conduct.error is None
@@ -455,7 +455,7 @@ def test_nothing_is_decided_behind_a_ctrl_c(session: Session, batches: list[Batc
     assert session.plan.certificate.path.read_bytes() == before
 
 
-def test_a_certificate_that_somebody_changed_meanwhile_is_not_overwritten(
+def test_an_active_certificate_that_was_changed_meanwhile_is_not_overwritten(
     session: Session, batches: list[Batch], found: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(controllers, "decide_alone", lambda _: True)
@@ -467,7 +467,7 @@ def test_a_certificate_that_somebody_changed_meanwhile_is_not_overwritten(
     assert active.read_text().endswith("# by hand\n")
 
 
-def test_steps_left_are_those_not_done_with_all_that_they_had() -> None:
+def test_the_remaining_steps_keep_all_their_settings() -> None:
     text = ONE.replace(
         "poses: [", "poses: [{id: a, up: +X, east: +Y, turn_deg: -180, align_s: 40, repeats: 2}, "
     )

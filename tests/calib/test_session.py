@@ -85,7 +85,7 @@ def accepted_step(step_id: str, recording: str, degc: dict[str, float], **more: 
 
 @pytest.fixture
 def accept(recorded: Callable[..., Path]) -> Accept:
-    """Files an attempt with its files; the recording begins at `since`, the evidence at 1000."""
+    """Accept an attempt with its files; the recording begins at `since`, the evidence at 1000."""
 
     def accept(
         session: Session, step_id: str, degc: dict[str, float] = DEGC, since: int = 900, **more: object
@@ -109,7 +109,7 @@ def session(tmp_path: Path) -> Iterator[Session]:
 
 @pytest.fixture
 def folder(tmp_path: Path, accept: Accept) -> Path:
-    """A small session that is closed."""
+    """A small closed session."""
     session = begin(tmp_path / "session")
     accept(session, "z-up")
     session.append(Entered(Phase.PLACE, "x-up", 1, 1900))
@@ -125,10 +125,10 @@ def line_of(data: bytes, at: int) -> int:
     return data.count(b"\n", 0, at) + 1
 
 
-# The chain
+# Hash chain
 
 
-def test_each_line_is_json_and_bears_the_hash_of_its_text_and_of_the_line_before(folder: Path) -> None:
+def test_each_line_is_json_with_the_hash_of_its_text_and_of_the_line_before(folder: Path) -> None:
     before = ""
     for line in (folder / JOURNAL).read_text().splitlines():
         entry = json.loads(line)
@@ -147,7 +147,7 @@ def test_the_first_line_holds_the_plan(folder: Path) -> None:
     assert "latitude_deg: 28.2" in plan["site"]["text"]
 
 
-def test_a_whole_session_is_found_whole(folder: Path) -> None:
+def test_an_intact_session_has_no_faults(folder: Path) -> None:
     assert verify(folder).faults == ()
 
 
@@ -184,7 +184,7 @@ def test_a_flipped_bit_in_a_file_is_found_and_the_file_named(folder: Path, name:
     assert f"{folder / name}: expected a file, there is none" in fault
 
 
-def test_a_line_that_was_taken_out_or_put_in_or_moved_is_named(folder: Path) -> None:
+def test_a_removed_inserted_or_moved_line_is_named(folder: Path) -> None:
     journal = folder / JOURNAL
     lines = journal.read_bytes().splitlines(keepends=True)
     for changed, number in (
@@ -197,7 +197,7 @@ def test_a_line_that_was_taken_out_or_put_in_or_moved_is_named(folder: Path) -> 
         assert f"line {number}: does not follow the line before it" in fault
 
 
-def test_a_file_that_the_journal_does_not_know_is_told(folder: Path) -> None:
+def test_a_file_that_is_not_in_the_journal_is_reported(folder: Path) -> None:
     (folder / "notes.txt").write_text("by hand\n")
     verified = verify(folder)
     assert verified.faults == ()
@@ -278,7 +278,9 @@ def test_an_entry_that_is_not_valid_is_refused_with_its_field(line: dict[str, An
 # Power cuts
 
 
-def test_a_journal_cut_anywhere_in_its_last_line_goes_on_and_nothing_before_it_changes(folder: Path) -> None:
+def test_a_journal_cut_in_its_last_line_is_repaired_and_nothing_before_it_changes(
+    folder: Path,
+) -> None:
     journal = folder / JOURNAL
     data = journal.read_bytes()
     last = data.rindex(b"\n", 0, -1) + 1
@@ -311,7 +313,7 @@ def test_a_second_power_cut_while_the_first_is_repaired_does_no_harm(folder: Pat
         assert journal.read_bytes() == repaired
 
 
-def test_what_was_dropped_cannot_be_changed_later(folder: Path) -> None:
+def test_a_dropped_line_cannot_be_changed_later(folder: Path) -> None:
     journal = folder / JOURNAL
     torn = journal.read_bytes()[:-30]
     journal.write_bytes(torn)
@@ -332,7 +334,7 @@ def test_a_broken_line_elsewhere_is_an_error_that_names_it(folder: Path) -> None
         Session.open(folder)
 
 
-def test_a_last_line_that_is_whole_but_wrong_is_damage_and_no_power_cut(folder: Path) -> None:
+def test_a_complete_but_wrong_last_line_is_damage_and_no_power_cut(folder: Path) -> None:
     journal = folder / JOURNAL
     data = journal.read_bytes()
     journal.write_bytes(data[:-200] + data[-200:].replace(b"x-up", b"y-up"))
@@ -340,7 +342,7 @@ def test_a_last_line_that_is_whole_but_wrong_is_damage_and_no_power_cut(folder: 
         Session.open(folder)
 
 
-def test_a_journal_without_its_first_line_is_no_session(folder: Path) -> None:
+def test_a_journal_without_a_complete_first_line_is_refused(folder: Path) -> None:
     (folder / JOURNAL).write_bytes(b'{"event": "pl')
     with pytest.raises(InputError, match="expected the plan in line 1"):
         Session.open(folder)
@@ -382,9 +384,7 @@ def test_a_recording_that_does_not_cover_its_step_is_named_whether_there_is_a_ce
             )
 
 
-def test_a_step_that_is_withdrawn_takes_what_was_concluded_from_it_along(
-    session: Session, accept: Accept
-) -> None:
+def test_withdrawing_a_step_withdraws_the_result(session: Session, accept: Accept) -> None:
     accept(session, "z-up")
     accept(session, "x-up", since=1234)
     session.append(FINISHED)
@@ -405,7 +405,7 @@ def test_a_step_that_is_withdrawn_takes_what_was_concluded_from_it_along(
     check_files(session)
 
 
-def test_a_step_that_there_is_not_cannot_be_done_again_and_the_steps_are_listed(
+def test_an_unknown_step_cannot_be_done_again_and_the_steps_are_listed(
     session: Session, accept: Accept
 ) -> None:
     accept(session, "z-up")
@@ -430,7 +430,7 @@ def test_once_the_result_is_accepted_only_the_verification_is_done_again(
     assert session.stage(Decision) is not None
 
 
-def test_an_attempt_that_a_kill_has_ended_counts_and_its_files_are_recorded(session: Session) -> None:
+def test_an_interrupted_attempt_counts_and_its_files_are_recorded(session: Session) -> None:
     (session.folder / "run-z-up-1.mcap").write_bytes(b"cut")
     (session.folder / "run-z-up-back-7.mcap").write_bytes(b"of another step")
     assert session.next_attempt("z-up") == 2
@@ -439,12 +439,12 @@ def test_an_attempt_that_a_kill_has_ended_counts_and_its_files_are_recorded(sess
     assert verify(session.folder).faults == ()
 
 
-def test_two_cannot_work_on_one_session(session: Session) -> None:
+def test_only_one_process_can_open_a_session(session: Session) -> None:
     with pytest.raises(InputError, match="another process has this session open"):
         Session.open(session.folder)
 
 
-def test_a_new_session_does_not_touch_one_that_is_there(folder: Path) -> None:
+def test_a_new_session_does_not_touch_an_existing_one(folder: Path) -> None:
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     with pytest.raises(InputError, match="expected a new folder, it contains a session"):
         begin(folder)
@@ -528,7 +528,7 @@ def test_a_session_with_a_damaged_recording_is_not_resumed(session: Session, acc
         check_files(session)
 
 
-def test_a_number_that_json_does_not_know_is_refused_before_it_is_written(session: Session) -> None:
+def test_a_number_that_is_not_json_is_refused_before_it_is_written(session: Session) -> None:
     before = (session.folder / JOURNAL).read_bytes()
     with pytest.raises(ValueError, match="not JSON compliant"):
         session.append(UnitDetected(1, False, {"gyro": float(np.nan)}))
