@@ -24,7 +24,7 @@ from typing import Any, Final
 import numpy as np
 
 from calib.bench.verify import verify
-from imudrv.calibration import SizeEffect, read_calibration
+from imudrv.calibration import read_calibration
 from imudrv.units import MM
 
 RUN: Final = (
@@ -111,10 +111,8 @@ def check(folder: Path, undisturbed: Path) -> list[str]:
                     faults.append(f"{folder}: {entry['recording']}: a sample was logged twice")
         elif entry["event"] == "entered" and entry["phase"] == "place" and entry["step_id"] in done:
             faults.append(f"{folder}: {entry['step_id']} was asked again")
-    found, expected = size_effect(folder), size_effect(undisturbed)
-    assert found.covariance_m2 is not None
-    sigma = np.sqrt(np.diag(found.covariance_m2)).reshape(3, 3)
-    apart = np.abs(found.r_m - expected.r_m)
+    (found, sigma), (expected, _) = sensing_points(folder), sensing_points(undisturbed)
+    apart = np.abs(found - expected)
     print(f"{folder.name}: {apart.max() / MM:.4f} mm from undisturbed, {(apart / sigma).max():.2f} sigma")
     if (apart > 3.0 * 2.0**0.5 * sigma).any():
         faults.append(f"{folder}: the result is not that of the undisturbed session")
@@ -133,11 +131,12 @@ def journal(folder: Path) -> list[dict[str, Any]]:
     return lines
 
 
-def size_effect(folder: Path) -> SizeEffect:
-    """Return the size effect of a session's result."""
+def sensing_points(folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return the sensing points of a session's result, and their sigma, m, shape (3, 3) each."""
     found = read_calibration(folder / "certificate.yaml").size_effect
-    assert found is not None
-    return found
+    if found is None or found.covariance_m2 is None:
+        raise SystemExit(f"{folder}: expected a certificate with a size effect and its covariance")
+    return found.r_m, np.sqrt(np.diag(found.covariance_m2)).reshape(3, 3)
 
 
 if __name__ == "__main__":

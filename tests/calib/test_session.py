@@ -3,11 +3,13 @@
 import json
 from collections.abc import Callable, Iterator
 from hashlib import sha256
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from calib.bench import journal as journals
 from calib.bench.entries import (
@@ -19,7 +21,7 @@ from calib.bench.entries import (
     from_json,
     to_json,
 )
-from calib.bench.resume import check_files, require_same, require_temperature
+from calib.bench.resume import check_files, require_same, require_temperature, resume
 from calib.bench.session import Session
 from calib.bench.state import JOURNAL
 from calib.bench.verify import verify
@@ -526,6 +528,25 @@ def test_a_session_with_a_damaged_recording_is_not_resumed(session: Session, acc
     (session.folder / "run-z-up-1.mcap").write_bytes(b"other")
     with pytest.raises(InputError, match=r"cannot be resumed:\n  .*run-z-up-1.mcap: was damaged"):
         check_files(session)
+
+
+@pytest.mark.parametrize("answer", ["y", "n"])
+def test_the_operator_is_asked_before_a_session_is_resumed(
+    session: Session, accept: Accept, monkeypatch: pytest.MonkeyPatch, answer: str
+) -> None:
+    accept(session, "z-up")
+    shown, before = StringIO(), len(session.entries)
+    monkeypatch.setattr("builtins.input", lambda *_: answer)
+    console = Console(file=shown, width=200)
+    if answer == "n":
+        with pytest.raises(InputError, match="not resumed and not changed"):
+            resume(session, console, ["z-up"], asks=True)
+        assert len(session.entries) == before
+    else:
+        resume(session, console, ["z-up"], asks=True)
+        assert events(session)[before:] == ["redone", "resumed"]
+    assert "of unit nominal: accepted steps: z-up" in shown.getvalue()
+    assert "resume it? [y/n]" in shown.getvalue()
 
 
 def test_a_number_that_is_not_json_is_refused_before_it_is_written(session: Session) -> None:
