@@ -2,10 +2,10 @@
 
     python tools/rehearse_kills.py [--kills 30] [--seed 1] [FOLDER]
 
-Every third time it runs at a terminal that takes no output, as after Ctrl-S.
+Every third run has a terminal that accepts no output, as after Ctrl-S.
 
-At the end the session has to verify, no accepted step may have been asked again, no sample logged twice, and
-the result must be that of an undisturbed rehearsal within three sigma of their difference.
+At the end the session must verify, no accepted step may have been repeated, no sample logged twice, and the
+result must agree with that of an undisturbed rehearsal within three sigma of their difference.
 """
 
 import argparse
@@ -24,20 +24,20 @@ from typing import Any, Final
 import numpy as np
 
 from calib.bench.verify import verify
-from imudrv.calibration import SizeEffect, read_calibration
+from imudrv.calibration import read_calibration
 from imudrv.units import MM
 
 RUN: Final = (
     "import sys; from pathlib import Path; from rich.console import Console; "
-    "from calib.bench.run import run; "
-    "run(folder=Path(sys.argv[1]), rehearse=True, speed='max', console=Console())"
+    "from calib.bench.run import RunOptions, run; "
+    "run(RunOptions(Path(sys.argv[1]), rehearse=True, speed='max'), Console())"
 )
 PAUSE_S: Final = (3.0, 25.0)
-"""A process lives so long at least, for it takes a while to start, and at most."""
+"""Shortest and longest life of a process; it takes a while to start."""
 
 
 def main() -> int:
-    """Run it."""
+    """Run the rehearsals and print the faults."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folder", type=Path, nargs="?", help="where the two sessions go")
     parser.add_argument("--kills", type=int, default=30)
@@ -70,7 +70,7 @@ def main() -> int:
 
 
 def rehearse(folder: Path, longest_s: float | None = None, is_stopped: bool = False) -> bool:
-    """Rehearse, or go on with it, into a log or a stopped terminal; whether it came to its end in time."""
+    """Begin or resume a rehearsal, into a log or a stopped terminal; return whether it ended in time."""
     with ExitStack() as opened:
         output: Any = opened.enter_context(open(f"{folder}.log", "a"))
         if is_stopped:
@@ -98,7 +98,7 @@ def rehearse(folder: Path, longest_s: float | None = None, is_stopped: bool = Fa
 
 
 def check(folder: Path, undisturbed: Path) -> list[str]:
-    """What is wrong with a session that was disturbed."""
+    """Return the faults of a disturbed session."""
     faults = list(verify(folder).faults)
     done: set[str] = set()
     for entry in journal(folder):
@@ -111,10 +111,8 @@ def check(folder: Path, undisturbed: Path) -> list[str]:
                     faults.append(f"{folder}: {entry['recording']}: a sample was logged twice")
         elif entry["event"] == "entered" and entry["phase"] == "place" and entry["step_id"] in done:
             faults.append(f"{folder}: {entry['step_id']} was asked again")
-    found, expected = size_effect(folder), size_effect(undisturbed)
-    assert found.covariance_m2 is not None
-    sigma = np.sqrt(np.diag(found.covariance_m2)).reshape(3, 3)
-    apart = np.abs(found.r_m - expected.r_m)
+    (found, sigma), (expected, _) = sensing_points(folder), sensing_points(undisturbed)
+    apart = np.abs(found - expected)
     print(f"{folder.name}: {apart.max() / MM:.4f} mm from undisturbed, {(apart / sigma).max():.2f} sigma")
     if (apart > 3.0 * 2.0**0.5 * sigma).any():
         faults.append(f"{folder}: the result is not that of the undisturbed session")
@@ -122,22 +120,23 @@ def check(folder: Path, undisturbed: Path) -> list[str]:
 
 
 def journal(folder: Path) -> list[dict[str, Any]]:
-    """Whole lines of a session's journal."""
+    """Return the complete lines of a session's journal."""
     path = folder / "journal.jsonl"
     lines = []
     for line in path.read_text(errors="replace").splitlines() if path.exists() else []:
         try:
             lines.append(json.loads(line))
         except ValueError:
-            continue  # what a kill left
+            continue  # a partial line after a kill
     return lines
 
 
-def size_effect(folder: Path) -> SizeEffect:
-    """Of a session's result."""
+def sensing_points(folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return the sensing points of a session's result, and their sigma, m, shape (3, 3) each."""
     found = read_calibration(folder / "certificate.yaml").size_effect
-    assert found is not None
-    return found
+    if found is None or found.covariance_m2 is None:
+        raise SystemExit(f"{folder}: expected a certificate with a size effect and its covariance")
+    return found.r_m, np.sqrt(np.diag(found.covariance_m2)).reshape(3, 3)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,11 @@
 """A session at the bench with an operator.
 
-session, journal, evidence, verify      store, recompute, audit
-controller, queue_sink                  worker thread
+entries, journal                        events of a session, and their append-only file
+state, session                          what the journal determines, and the folder open for writing
+evidence, verify                        recompute the result, audit
+controller, queue_sink, recordings      worker thread: steps and their recordings
+completion                              decision, certificate and report
 screen, keys, block_letters             terminal of the operator
-run, simulated_unit, technician         `calib run`, rehearsal
+run, resume                             `calib run`, a new or an existing session
+simulated_unit, technician              rehearsal
 """

@@ -1,10 +1,10 @@
-"""Block letters, to be read from across the room."""
+"""Block letters, readable from across the room."""
 
 from collections.abc import Sequence
 from typing import Final
 
 HEIGHT: Final = 5
-"""Of a letter, dots."""
+"""Height of a letter, dots."""
 
 
 _GLYPHS: Final = {
@@ -73,12 +73,12 @@ def dots(text: str) -> list[str]:
     Parameters
     ----------
     text : str
-        Small letters become capitals.
+        Lower case is drawn as upper case.
 
     Returns
     -------
     list of str
-        `HEIGHT` rows of ``#`` and ``.``, one as long as the other.
+        `HEIGHT` rows of ``#`` and ``.``, all of the same length.
     """
     glyphs = [_SPACE if letter == " " else _GLYPHS.get(letter, _UNKNOWN) for letter in text.upper()]
     return [".".join(glyph[row] for glyph in glyphs) for row in range(HEIGHT)]
@@ -90,7 +90,7 @@ def fitted(text: str, width: int, height: int) -> tuple[int, list[str]]:
     Parameters
     ----------
     text : str
-        Words.
+        Words to draw.
     width, height : int
         Cells of the terminal; a cell is one dot wide and two high.
 
@@ -109,12 +109,12 @@ def fitted(text: str, width: int, height: int) -> tuple[int, list[str]]:
 
 
 def rows(lines: Sequence[str], scale: int) -> int:
-    """Cells that lines take from top to bottom, with a gap between them."""
+    """Return the height of lines with gaps between them, cells."""
     return len(lines) * cells(scale) + len(lines) - 1
 
 
 def cells(scale: int) -> int:
-    """Cells that a line takes from top to bottom."""
+    """Return the height of a line, cells."""
     return -(-HEIGHT * scale // 2)
 
 
@@ -124,11 +124,11 @@ def blocks(text: str, scale: int, ascii_only: bool = False) -> list[str]:
     Parameters
     ----------
     text : str
-        What it says.
+        Text to draw.
     scale : int
-        Cells a dot is wide; it is half as many high.
+        Width of a dot, cells; its height is half as many.
     ascii_only : bool
-        The terminal knows no blocks.
+        The terminal has no block characters.
 
     Returns
     -------
@@ -150,7 +150,7 @@ _SIGN: Final = {(".", "."): 0, ("#", "#"): 1, ("#", "."): 2, (".", "#"): 3}
 
 
 def _balanced(lines: list[str]) -> list[str]:
-    """As many lines, the longest of them as short as can be."""
+    """Break the text into the same number of lines, the longest as short as possible."""
     words = " ".join(lines).split()
     for width in range(max(len(dots(line)[0]) for line in lines) - 1, 0, -1):
         shorter = _wrapped(words, width)
@@ -161,7 +161,7 @@ def _balanced(lines: list[str]) -> list[str]:
 
 
 def _wrapped(words: Sequence[str], width: int) -> list[str]:
-    """Lines of at most `width` dots; none if a word is wider."""
+    """Break words into lines of at most `width` dots; return none if a word is wider."""
     lines: list[str] = []
     for word in words:
         longer = f"{lines[-1]} {word}" if lines else word

@@ -1,107 +1,100 @@
 """Run a bench session: feed the procedure, write journal and recordings, drive the screen (own thread).
 
-The service reads the unit in the main thread, as it does in production. One of its sinks is the `QueueSink`,
-from which `SessionController` takes samples: it feeds the engine, journals its events, begins and ends
-recordings, shows the view and reads keys. Engine and session do not know each other.
+The service reads the unit in the main thread, as in production. One of its sinks is the `QueueSink`, from
+which `SessionController` takes samples: it feeds the engine, journals its events, begins and ends recordings,
+shows the view and reads keys. Engine and session do not know each other.
 
-The worker may be late, by seconds on a loaded machine or a slow disk, and the evidence is right all the same:
+The worker may be late, by seconds on a loaded machine or a slow disk; the evidence is complete all the same:
 
-- A recording begins at the sample at which the engine asked for the unit to be placed, however late the
-  worker comes to that event: the service keeps the last minutes of the line (`imudrv.sinks.history`).
+- A recording begins at the sample at which the engine asked to place the unit, however late the worker
+  handles that event: the service keeps the last minutes of wire data (`imudrv.sinks.history`).
 - A step is accepted, shown as good and journaled only after its recording has been closed, decoded and found
-  to hold every sample of the evidence. Otherwise the step is rejected with that reason and asked again.
-- The worker never waits for the terminal: a `OperatorScreen` writes in a thread of its own.
+  to contain every sample of the evidence. Otherwise the step is rejected with that reason and repeated.
+- The worker never waits for the terminal: an `OperatorScreen` writes in a thread of its own.
 
-A session goes through stages: the steps, the result, the decision, the verification. Each leaves its line in
-the journal, so that a session that is resumed goes on behind the last.
+The stages of a session are the steps, the result, the decision and the verification. Each is journaled, so
+that a resumed session continues after the last one.
 """
 
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, wait
-from dataclasses import asdict, fields
-from queue import Empty
 from typing import Final
 
 import numpy as np
 
-from calib.bench.evidence import Attempt, ResidualVelocity, Result, residual_velocity, uncovered
-from calib.bench.journal import Entry
+from calib.bench.completion import (
+    activate,
+    ask_operator,
+    decide_alone,
+    session_result,
+    summary,
+    verification_residual,
+    write_report,
+)
+from calib.bench.entries import Counted, Decision, ServiceMessage, SessionEnded, UnitDetected
+from calib.bench.evidence import Result
 from calib.bench.keys import Keyboard
-from calib.bench.queue_sink import QueueSink
+from calib.bench.queue_sink import QueueReader, QueueSink, ServiceEndedError
+from calib.bench.recordings import AttemptRecordings
+from calib.bench.resume import require_temperature
 from calib.bench.screen import OperatorScreen, with_port_state
-from calib.bench.session import REPORT, RESULT, Session
-from calib.certificate import write
-from calib.lever_arms.gauge import convert
+from calib.bench.session import Session
+from calib.bench.state import REPORT
 from calib.procedure.engine import Engine
 from calib.procedure.events import Aborted, Accepted, Conditions, Entered, Event, Finished, Phase, Rejected
 from calib.procedure.messages import english
 from calib.procedure.plan import steps_left, verification
 from calib.procedure.schema import VERIFICATION, Procedure
-from calib.reports.identification import arms_text, report_html, verdict
-from imudrv.calibration import Calibration, read_calibration, write_calibration
 from imudrv.errors import InputError
-from imudrv.files import atomic
-from imudrv.files.atomic import atomic_write
 from imudrv.records import INCREMENTS, Records
 from imudrv.service.loop import Service
 from imudrv.sinks.base import Batch
 from imudrv.units import NS_PER_S
 from imudrv.wire.layout import Layout
 
-SHOWN_S: Final = 0.2
-"""The screen is drawn anew this often, and keys are read."""
+REDRAW_S: Final = 0.2
+"""Interval at which the screen is redrawn and keys are read, s."""
 
 
-ABORT: Final = "q once more: abort, keep what is accepted. Any other key: go on"
-
-
-CLOSED_S: Final = 10.0
-"""Longest wait for a recording to be closed once the service has ended."""
-
-
-class _StoppedError(Exception):
-    """The service has ended before the session."""
+ABORT: Final = "q again: abort, accepted steps are kept. Any other key: continue"
 
 
 class SessionController:
-    """The worker: leads a session to its end, or as far as it gets.
+    """Worker that conducts a session to its end, or as far as possible.
 
     Parameters
     ----------
     session : Session
-        Open.
-    procedure : Procedure
-        Of the session.
+        The session, open.
     layout : Layout
-        Of the unit.
+        Wire layout of the unit.
     service : Service
-        That reads it.
-    tap : Tap
+        Reads the unit.
+    queue : QueueSink
         One of the service's sinks.
     screen, keys
-        Of the operator.
+        The operator's terminal.
     hands_free : bool
-        Nobody presses keys.
+        No keys are expected.
     begin : callable
-        Told the procedure, of which each step is wanted, before its samples are: a rehearsal begins then.
+        Called with the procedure of the steps to do, before their samples are read; a rehearsal starts its
+        unit then.
 
     Attributes
     ----------
     error : BaseException or None
-        What went wrong.
+        Error that ended the work.
     outcome : str
-        What has come out, in plain words; empty: the session is not at its end.
+        Summary for the operator; empty if the session is not at its end.
     """
 
     def __init__(
         self,
         session: Session,
-        procedure: Procedure,
         layout: Layout,
         service: Service,
-        tap: QueueSink,
+        queue: QueueSink,
         screen: OperatorScreen,
         keys: Keyboard,
         *,
@@ -110,81 +103,82 @@ class SessionController:
     ) -> None:
         self.error: BaseException | None = None
         self.outcome = ""
-        self._session, self._procedure, self._layout = session, procedure, layout
+        self._session, self._layout, self._service = session, layout, service
+        self._procedure = procedure = session.procedure()
         self._steps = {step.id: step for step in (*procedure.steps, *verification(procedure).steps)}
-        self._service, self._tap, self._screen, self._keys = service, tap, screen, keys
+        self._sink, self._screen, self._keys = queue, screen, keys
+        self._queue = QueueReader(queue, lambda text: session.append(ServiceMessage(text)))
+        self._recordings = AttemptRecordings(session, service, self._queue)
         self._hands_free, self._begin = hands_free, begin
-        self._is_new_to_unit = True
-        self._backlog: deque[Batch] = deque()
-        self._recording = ""
-        self._has_ended = False
+        self._is_unit_detected = False
         self._conditions = Conditions()
-        self._told_ns = 0
+        self._conditions_ns = 0
 
     def run(self) -> None:
-        """Work, in a thread of its own."""
+        """Conduct the session, in a thread of its own."""
         try:
             with self._keys:
-                self._stages()
-        except _StoppedError:
+                self._run_stages()
+        except ServiceEndedError:
             pass
         except BaseException as error:
             self.error = error
         finally:
-            self._tap.release()
+            self._sink.release()
             self._service.stop()
             self._screen.close()
 
-    def _stages(self) -> None:
+    def _run_stages(self) -> None:
         session = self._session
-        if session.entry("finished") is None:
-            last = self._through(self._procedure)
+        if session.stage(Finished) is None:
+            last = self._run_steps(self._procedure)
             if isinstance(last, Aborted):
                 return
             if last.reasons:
-                raise InputError(
-                    "\n  ".join(
-                        [
-                            "too few steps are accepted; resume for those that were skipped:",
-                            *map(english, last.reasons),
-                        ]
-                    )
-                )
-            session.append(_entry(last))
-        self._screen.print("The lever arms are computed from the recordings ...")
-        result = self._result()
-        if self._tap.is_closed:
-            raise _StoppedError  # nothing is decided behind a Ctrl-C
-        decision = session.entry("decision")
-        if decision is None:
-            decision = {"event": "decision", "accepted": self._decided(result)}
-            session.append(decision)
-        if not decision["accepted"]:
-            self.outcome = f"turned down; {session.plan.certificate} stays as it was"
+                missing = "\n  ".join(map(english, last.reasons))
+                raise InputError(f"too few steps are accepted; resume and do the skipped ones:\n  {missing}")
+            session.append(last)
+        self._screen.print("Computing the lever arms from the recordings ...")
+        result = session_result(session)
+        if self._sink.is_closed:
+            raise ServiceEndedError  # nothing is decided after Ctrl-C
+        if not self._is_accepted(result):
+            self.outcome = f"rejected; certificate unchanged: {session.plan.certificate.path}"
             return
-        self._activate(result.certificate)
-        last = self._through(verification(self._procedure))
+        activate(session, result.certificate)
+        last = self._run_steps(verification(self._procedure))
         if isinstance(last, Aborted):
             return
-        left = self._left(result.certificate) if VERIFICATION in last.accepted else None
-        if session.entry("end") is None:
-            self._write_report(result, left)
-            session.append({"event": "end", "velocity_left_m_s": None if left is None else left._asdict()})
-        self.outcome = "\n".join(
-            [
-                f"active certificate: {session.plan.certificate}",
-                f"verification: {left or 'skipped'}",
-                f"report: {session.folder / REPORT}",
-            ]
+        residual = None
+        if VERIFICATION in last.accepted:
+            residual = verification_residual(session, result.certificate)
+        if session.stage(SessionEnded) is None:
+            write_report(session, result, residual)
+            session.append(SessionEnded(residual))
+        self.outcome = (
+            f"active certificate: {session.plan.certificate.path}\n"
+            f"verification: {residual or 'skipped'}\n"
+            f"report: {session.folder / REPORT}"
         )
 
-    # Steps
+    def _is_accepted(self, result: Result) -> bool:
+        """Return the decision in the journal, or take it now."""
+        decision = self._session.stage(Decision)
+        if decision is None:
+            self._screen.print(summary(result))
+            if self._hands_free:
+                decision = Decision(decide_alone(result))
+            else:
+                unit = self._session.plan.unit
+                decision = Decision(ask_operator(unit, self._screen, self._keys, self._queue))
+            self._session.append(decision)
+        return decision.accepted
 
-    def _through(self, procedure: Procedure) -> Finished | Aborted:
-        """Lead through the steps that are not accepted yet; all evidence is filed when it returns."""
+    def _run_steps(self, procedure: Procedure) -> Finished | Aborted:
+        """Conduct the steps that are not accepted yet; on return all evidence is filed."""
         session = self._session
         ids = {step.id for step in procedure.steps}
-        accepted = {name: _accepted(entry) for name, entry in session.accepted.items() if name in ids}
+        accepted = {name: step for name, step in session.accepted.items() if name in ids}
         engine = Engine(
             procedure,
             session.site(),
@@ -192,228 +186,83 @@ class SessionController:
             interval_ns=self._layout.interval_ns,
             hands_free=self._hands_free,
             accepted=accepted,
-            attempts={name: session.attempt(name) - 1 for name in ids},
+            attempts={name: session.next_attempt(name) - 1 for name in ids},
         )
-        last = self._happened(engine, engine.feed(np.zeros(0, INCREMENTS)))
+        last = self._apply_events(engine, engine.feed(np.zeros(0, INCREMENTS)))
         if last is None:
             self._begin(steps_left(procedure, accepted))
         try:
             shown_s = 0.0
             while last is None:
-                batch = self._next()
-                events = () if batch is None else self._sampled(engine, batch)
-                is_due = time.monotonic() - shown_s >= SHOWN_S
+                batch = self._queue.next()
+                events = () if batch is None else self._feed(engine, batch)
+                is_due = time.monotonic() - shown_s >= REDRAW_S
                 if is_due and (shown := self._screen.shown) and (action := self._keys.action(shown)):
                     events += engine.handle(action)
-                last = self._happened(engine, events)
+                last = self._apply_events(engine, events)
                 if events or is_due:
                     shown_s = time.monotonic()
                     view = with_port_state(engine.view, self._service.port_state)
                     self._screen.show(view, ABORT if self._keys.asks else "")
-        except _StoppedError:
-            self._enter_recording()  # the service has closed it
+        except ServiceEndedError:
+            self._recordings.record_closed()
             raise
-        self._end_recording()
+        self._recordings.end()
         return last
 
-    def _next(self) -> Batch | None:
-        """Samples, kept or new; None: there is something else to do."""
-        return self._backlog.popleft() if self._backlog else self._take()
-
-    def _take(self) -> Batch | None:
-        if self._has_ended:
-            raise _StoppedError
-        try:
-            item = self._tap.take(SHOWN_S)
-        except Empty:
-            return None
-        if isinstance(item, Batch):
-            return item
-        if item is None:
-            self._has_ended = True
-            raise _StoppedError
-        self._session.append({"event": "service", "text": item})
-        return None
-
-    def _wait(self, done: Future[None]) -> None:
-        """Wait until the service has done something or has ended; samples that come meanwhile are kept."""
-        try:
-            while not done.done():
-                if batch := self._take():
-                    self._backlog.append(batch)
-        except _StoppedError:
-            wait([done], CLOSED_S)
-        if done.done() and not done.cancelled():
-            done.result()
-
-    def _sampled(self, engine: Engine, batch: Batch) -> tuple[Event, ...]:
+    def _feed(self, engine: Engine, batch: Batch) -> tuple[Event, ...]:
+        """Feed samples to the engine, and status and temperatures once a second or at a change of status."""
         events: tuple[Event, ...] = ()
         if len(batch.pulses):
             newest = batch.pulses[-1]
             conditions = _conditions(newest, self._layout)
-            since_ns = int(newest["elapsed_ns"]) - self._told_ns
+            since_ns = int(newest["elapsed_ns"]) - self._conditions_ns
             if conditions.bits != self._conditions.bits or not 0 <= since_ns < NS_PER_S:
-                self._conditions, self._told_ns = conditions, int(newest["elapsed_ns"])
-                if self._is_new_to_unit:
-                    self._is_new_to_unit = False
-                    self._recognise(int(newest["counter"]))
+                self._conditions, self._conditions_ns = conditions, int(newest["elapsed_ns"])
+                if not self._is_unit_detected:
+                    self._is_unit_detected = True
+                    self._check_unit(int(newest["counter"]))
                 events = engine.update_status(conditions)
         return events + engine.feed(batch.increments)
 
-    def _recognise(self, counter: int) -> None:
-        """Whether the unit, heard for the first time in this process, may go on where the session was."""
-        session = self._session
-        session.require_temperature(self._conditions.temperature_degc)
-        newest = max((entry.get("counter", -1) for entry in session.entries), default=-1)
-        session.append(
-            {
-                "event": "heard",
-                "counter": counter,
-                "restarted": counter < newest,
-                "temperature_degc": dict(self._conditions.temperature_degc),
-            }
-        )
+    def _check_unit(self, counter: int) -> None:
+        """Check the temperature of the unit when its first data arrive, and note whether it has restarted."""
+        session, degc = self._session, dict(self._conditions.temperature_degc)
+        require_temperature(session, degc)
+        newest = max((entry.counter for entry in session.entries if isinstance(entry, Counted)), default=-1)
+        session.append(UnitDetected(counter, counter < newest, degc))
 
-    def _happened(self, engine: Engine, events: Sequence[Event]) -> Finished | Aborted | None:
+    def _apply_events(self, engine: Engine, events: Sequence[Event]) -> Finished | Aborted | None:
+        """Journal events, begin and end recordings; return the event that ends the steps."""
         last: Finished | Aborted | None = None
         waiting = deque(events)
         while waiting:
             event = waiting.popleft()
             if isinstance(event, Accepted):
-                if reason := self._filed(engine, event):
+                if reason := self._file(engine, event):
                     waiting += engine.reject(event.step_id, reason)
-                continue
-            if isinstance(event, Finished | Aborted):
-                last = event
-            if isinstance(event, Rejected):
-                self._end_recording()
-                last = None
-            if isinstance(event, Entered) and event.phase is Phase.PLACE:
-                self._begin_recording(f"run-{event.step_id}-{event.attempt}", event.counter)
-            if not isinstance(event, Finished):
-                self._session.append(_entry(event))
+            elif isinstance(event, Finished):
+                last = event  # journaled with the stage
+            else:
+                if isinstance(event, Aborted):
+                    last = event
+                elif isinstance(event, Rejected):
+                    self._recordings.end()
+                    last = None
+                elif isinstance(event, Entered) and event.phase is Phase.PLACE:
+                    self._recordings.begin(f"run-{event.step_id}-{event.attempt}", event.counter)
+                self._session.append(event)
         return last
 
-    # Recordings
-
-    def _begin_recording(self, name: str, since: int) -> None:
-        if name == self._recording:
-            return
-        self._end_recording()
-        begun = self._service.record(self._session.folder / f"{name}.mcap", since)
-        self._wait(begun)
-        if begun.cancelled():
-            raise _StoppedError
-        self._recording = name
-
-    def _end_recording(self) -> None:
-        if self._recording:
-            self._wait(self._service.record(None))
-            self._enter_recording()
-
-    def _enter_recording(self) -> None:
-        name, self._recording = self._recording, ""
-        if name:
-            self._session.enter(f"{name}.mcap")
-
-    def _filed(self, engine: Engine, event: Accepted) -> str:
-        """File an accepted attempt: recording, log, then the line that makes it count; or say why not."""
-        session, name = self._session, self._recording
-        self._end_recording()
-        attempt = Attempt(
-            self._steps[event.step_id],
-            session.folder / f"{name}.mcap",
-            event.first_counter,
-            event.last_counter,
-            event.samples,
-        )
-        try:
-            lacks = uncovered(attempt)
-        except InputError as error:
-            return str(error)
-        if lacks:
-            return f"{lacks}: this computer, or its disk, was held up for too long"
+    def _file(self, engine: Engine, event: Accepted) -> str:
+        """File an accepted attempt; return why that is impossible."""
         log = next(log for log in reversed(engine.runs) if log.step_id == event.step_id)
-        with atomic_write(session.folder / f"{name}.npz") as archive:
-            np.savez(archive, **{f.name: getattr(log, f.name) for f in fields(log)})
-        session.enter(f"{name}.npz")
-        degc = dict(self._conditions.temperature_degc)
-        session.append({**_entry(event), "recording": f"{name}.mcap", "temperature_degc": degc})
-        return ""
-
-    # After the steps
-
-    def _result(self) -> Result:
-        session = self._session
-        result = session.identify()
-        path = session.folder / RESULT
-        if RESULT in session.files:
-            return result._replace(certificate=read_calibration(path))
-        path.unlink(missing_ok=True)  # of a process that was killed before it entered it
-        write_calibration(path, result.certificate)
-        session.enter(RESULT)
-        return result
-
-    def _decided(self, result: Result) -> bool:
-        self._screen.print(_summary(result))
-        if self._hands_free:
-            return all(mark != "bad" for mark, _ in verdict(result.findings))
-        self._screen.print(f"Accept it as the certificate of unit {self._session.plan.unit}? [y/n]")
-        while not self._screen.is_idle:
-            self._take()
-        self._keys.read()  # what was typed before the question is no answer to it
-        answer = ""
-        while not answer:
-            self._take()
-            answer = next((key for key in self._keys.read() if key in "yn"), "")
-        return answer == "y"
-
-    def _activate(self, certificate: Calibration) -> None:
-        """Make it the active one, unless it is already."""
-        session = self._session
-        active = session.plan.certificate
-        digest = atomic.sha256(active)
-        if digest == session.plan.certificate_sha256:
-            write(active, certificate)
-        elif digest != session.files[RESULT]:
-            raise InputError(
-                f"{active}: expected the certificate that the session began with, it was changed meanwhile; "
-                f"it stays so, the result is in {session.folder / RESULT}"
-            )
-
-    def _left(self, certificate: Calibration) -> ResidualVelocity:
-        """Velocity left by the verification rotation."""
-        session, procedure = self._session, verification(self._procedure)
-        attempt = session.attempt_at(procedure.steps[0])
-        return residual_velocity(procedure, attempt, certificate, session.site())
-
-    def _write_report(self, result: Result, left: ResidualVelocity | None) -> None:
-        findings = result.findings
-        html = report_html(findings, (findings.arms, convert(findings.arms, "x")))
-        words = "was skipped" if left is None else f"with the new certificate: {left}"
-        section = f"<section>\n<h2>Verification</h2>\n<p>One more rotation {words}.</p>\n</section>"
-        with atomic_write(self._session.folder / REPORT) as file:
-            file.write(html.replace("</section>", f"</section>\n{section}", 1).encode())  # behind the result
-        self._session.enter(REPORT)
-
-
-def _summary(result: Result) -> str:
-    """What the operator has to know to decide."""
-    verdicts = [f"{mark}: {text}" for mark, text in verdict(result.findings)]
-    return "\n".join([arms_text(result.findings.arms), *verdicts])
-
-
-def _entry(event: Event) -> Entry:
-    return {"event": type(event).__name__.lower(), **asdict(event)}
-
-
-def _accepted(entry: Entry) -> Accepted:
-    values = {f.name: entry[f.name] for f in fields(Accepted) if f.name in entry}
-    return Accepted(**{**values, "v_n": tuple(values["v_n"])})
+        degc = self._conditions.temperature_degc
+        return self._recordings.file(self._steps[event.step_id], event, log, degc)
 
 
 def _conditions(pulses: Records, layout: Layout) -> Conditions:
-    """What a sample tells beside its pulses."""
+    """Return status bits, faults and temperatures of a sample."""
 
     def names(word: int) -> tuple[str, ...]:
         return tuple(name for bit, name in layout.status_names if word >> bit & 1)

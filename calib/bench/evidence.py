@@ -1,25 +1,26 @@
-"""What the accepted recordings give: the lever arms, and the velocity that a rotation leaves.
+"""Results of the accepted recordings: lever arms, and the residual velocity after a rotation.
 
-All is made again from the wire bytes of the recordings, cut to the samples that the engine's verdict rests
-on.
+Both are computed from the wire bytes of the recordings, cut to the samples on which the engine accepted the
+attempt.
 """
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import islice
-from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.bench.entries import ResidualVelocity
+from calib.bench.state import Attempt, SessionState
 from calib.certificate import certificate, software
 from calib.detection.blocks import BLOCK_NS
 from calib.estimation.joint import estimate_joint
 from calib.estimation.runs import CaptureRuns, NavigationOptions, Priors, Run, navigate_rotations
 from calib.identification import CaptureSummary, IdentificationResult, PriorCalibration, Temperature
-from calib.procedure.schema import Procedure, Step
+from calib.procedure.schema import VERIFICATION, Procedure
 from imudrv.calibration import Calibration, coefficients
 from imudrv.errors import InputError
 from imudrv.files import atomic
@@ -30,103 +31,81 @@ from imudrv.imu.sequence import SampleCounts, SequenceTracker
 from imudrv.recording.reader import Recording
 from imudrv.records import Records
 from imudrv.site import Site
-from imudrv.units import MM, NS
+from imudrv.units import NS
 from imudrv.wire.decoder import FrameDecoder
 from imudrv.wire.layout import Layout
 
-LEFT_S: Final = 0.5
-"""Velocity left by a rotation is the mean over so long after it, less that before it."""
+RESIDUAL_WINDOW_S: Final = 0.5
+"""Averaging window for the velocity before and after a rotation, s."""
 
 
 _PUBLISHED_PERIOD: Final = 1 << 32
-"""Of the counter of published increments."""
+"""Period of the counter of published increments."""
 
 
-_AT_ONCE: Final = 1000
-"""Reads of the port that are decoded together: live each brings one sample."""
-
-
-class Attempt(NamedTuple):
-    """An accepted attempt at a step.
-
-    Attributes
-    ----------
-    step : Step
-        What was done.
-    recording : Path
-        Its recording.
-    first_counter, last_counter : int
-        Samples that the verdict rests on, both included, as the service counted them.
-    samples : int or None
-        How many there were; None: not known, as in sessions of an older version.
-    """
-
-    step: Step
-    recording: Path
-    first_counter: int
-    last_counter: int
-    samples: int | None = None
+_READS_PER_PIECE: Final = 1000
+"""Reads of the port that are decoded together; a live read brings one sample."""
 
 
 class Result(NamedTuple):
-    """What the accepted recordings give.
+    """Result of the accepted recordings.
 
     Attributes
     ----------
-    findings : Findings
+    findings : IdentificationResult
         The identification.
     certificate : Calibration
-        The unit's new one.
+        The unit's new certificate.
     """
 
     findings: IdentificationResult
     certificate: Calibration
 
 
-class ResidualVelocity(NamedTuple):
-    """Horizontal velocity that a rotation left, m/s.
+class _DecodedRecording(NamedTuple):
+    """Decoded evidence of an attempt.
 
     Attributes
     ----------
-    without, compensated : float
-        With the size effect in, and with it compensated.
+    pulses : Records
+        Samples of the evidence.
+    counter : ndarray of int64
+        Their counters, in the service's count.
+    layout : Layout
+        Of the recording.
+    counts : SampleCounts
+        Loss summary of the whole recording.
     """
 
-    without: float
-    compensated: float
-
-    def __str__(self) -> str:
-        """For people."""
-        return (
-            f"half a turn leaves {self.without / MM:.1f} mm/s with the size effect in, "
-            f"{self.compensated / MM:.1f} mm/s with it compensated"
-        )
-
-
-class _DecodedRecording(NamedTuple):
-    """What a recording holds of an attempt."""
-
-    pulses: Records  # of the evidence
-    counter: NDArray[np.int64]  # of the pulses, as the service counted them
+    pulses: Records
+    counter: NDArray[np.int64]
     layout: Layout
-    counts: SampleCounts  # of the whole recording
+    counts: SampleCounts
+
+
+def identify_session(session: SessionState) -> Result:
+    """Identify the lever arms from the accepted steps of a session; see `identify`."""
+    procedure = session.procedure()
+    attempts = session.attempts()
+    attempts.pop(VERIFICATION, None)
+    return identify(procedure, list(attempts.values()), session.initial_calibration(), session.site())
 
 
 def identify(
     procedure: Procedure, attempts: Sequence[Attempt], basis: PriorCalibration, site: Site
 ) -> Result:
-    """Find the lever arms.
+    """Identify the lever arms.
 
     Parameters
     ----------
     procedure : Procedure
-        That was carried out.
+        The procedure that was carried out.
     attempts : sequence of Attempt
-        The accepted ones.
-    basis : Basis
+        The accepted attempts.
+    basis : PriorCalibration
         The certificate before; its size effect is not used.
     site : Site
-        Where the unit stood.
+        Site of the bench.
 
     Returns
     -------
@@ -139,7 +118,7 @@ def identify(
     """
     priors = Priors()
     known = replace(coefficients(basis.calibration), r_b=None)
-    sources = tuple(_source(procedure, attempt, known, site, priors) for attempt in attempts)
+    sources = tuple(_summarise(procedure, attempt, known, site, priors) for attempt in attempts)
     findings = IdentificationResult(
         estimate_joint([run for source in sources for run in source.evidence.runs], priors),
         basis,
@@ -154,75 +133,75 @@ def identify(
 
 
 def uncovered(attempt: Attempt) -> str:
-    """Say which samples of an attempt its recording lacks.
+    """Describe the samples of an attempt that its recording lacks.
 
     Parameters
     ----------
     attempt : Attempt
-        Its recording is closed.
+        An attempt whose recording is closed.
 
     Returns
     -------
     str
-        In plain words, with the counters; empty: all are there.
+        Phrase with the counters; empty if the recording is complete.
 
     Raises
     ------
     InputError
         The recording cannot be read.
     """
-    return _lacks(attempt, _decoded(attempt))
+    return _missing(attempt, _decode(attempt))
 
 
 def require_covered(attempt: Attempt) -> None:
-    """Refuse an attempt of which the recording lacks samples.
+    """Refuse an attempt whose recording lacks samples.
 
     Parameters
     ----------
     attempt : Attempt
-        An accepted one.
+        An accepted attempt.
 
     Raises
     ------
     InputError
-        It lacks some, or cannot be read; says which and what to do.
+        Samples are missing, or the recording cannot be read; the message says which and what to do.
     """
-    _hear(attempt)
+    _decode_covered(attempt)
 
 
 def residual_velocity(
     procedure: Procedure, attempt: Attempt, calibration: Calibration, site: Site
 ) -> ResidualVelocity:
-    """Tell what compensation does for a rotation.
+    """Return the residual velocity after a rotation, without and with compensation.
 
     Parameters
     ----------
     procedure : Procedure
-        With the attempt's step.
+        Procedure with the attempt's step.
     attempt : Attempt
-        An accepted one.
+        An accepted attempt.
     calibration : Calibration
-        With its size effect.
+        Certificate with its size effect.
     site : Site
-        Where the unit stands.
+        Site of the bench.
 
     Returns
     -------
-    Left
+    ResidualVelocity
 
     Raises
     ------
     InputError
         The recording cannot be read or lacks its rotation.
     """
-    known, heard = coefficients(calibration), _hear(attempt)
-    rows = round(LEFT_S / (BLOCK_NS * NS))
-    left = []
+    known, decoded = coefficients(calibration), _decode_covered(attempt)
+    rows = round(RESIDUAL_WINDOW_S / (BLOCK_NS * NS))
+    residual = []
     for c in (replace(known, r_b=None), known):
-        run = _collected(procedure, attempt, heard, c, site, Priors()).runs[0]
+        run = _navigate(procedure, attempt, decoded, c, site, Priors()).runs[0]
         gained = _mean(run, run.after, slice(rows)) - _mean(run, run.before, slice(-rows, None))
-        left.append(float(np.hypot(gained[0], gained[1])))
-    return ResidualVelocity(*left)
+        residual.append(float(np.hypot(gained[0], gained[1])))
+    return ResidualVelocity(*residual)
 
 
 def _mean(run: Run, rest: np.ndarray, rows: slice) -> np.ndarray:
@@ -230,39 +209,39 @@ def _mean(run: Run, rest: np.ndarray, rows: slice) -> np.ndarray:
     return mean
 
 
-def _source(
+def _summarise(
     procedure: Procedure, attempt: Attempt, known: Coefficients, site: Site, priors: Priors
 ) -> CaptureSummary:
     with atomic.unchanged(attempt.recording):
-        heard = _hear(attempt)
+        decoded = _decode_covered(attempt)
         digest = atomic.sha256(attempt.recording)
-    degc = heard.pulses["temperature_degc"]
+    degc = decoded.pulses["temperature_degc"]
     return CaptureSummary(
         attempt.recording.stem,
         attempt.recording.name,
         digest,
-        heard.layout.name,
-        str(heard.counts),
+        decoded.layout.name,
+        str(decoded.counts),
         tuple(
             Temperature(name, float(t.min()), float(t.max()))
-            for name, column in zip(heard.layout.temperature_names, degc.T, strict=False)
+            for name, column in zip(decoded.layout.temperature_names, degc.T, strict=False)
             if (t := column[~np.isnan(column)]).size
         ),
-        _collected(procedure, attempt, heard, known, site, priors),
+        _navigate(procedure, attempt, decoded, known, site, priors),
     )
 
 
-def _collected(
+def _navigate(
     procedure: Procedure,
     attempt: Attempt,
-    heard: _DecodedRecording,
+    decoded: _DecodedRecording,
     known: Coefficients,
     site: Site,
     priors: Priors,
 ) -> CaptureRuns:
-    layout = heard.layout
+    layout = decoded.layout
     compensator = Compensator(known, layout, rate_filter("causal", layout.interval_ns))
-    increments = [compensator.feed(heard.pulses), compensator.close()]
+    increments = [compensator.feed(decoded.pulses), compensator.close()]
     evidence = navigate_rotations(
         lambda: increments,
         known.C_ba,
@@ -279,68 +258,70 @@ def _collected(
     return evidence
 
 
-def _hear(attempt: Attempt) -> _DecodedRecording:
-    """Decode a recording and cut it to the evidence, all of which has to be there."""
-    heard = _decoded(attempt)
-    if lacks := _lacks(attempt, heard):
+def _decode_covered(attempt: Attempt) -> _DecodedRecording:
+    """Decode a recording and cut it to the evidence, which must be complete."""
+    decoded = _decode(attempt)
+    if lacks := _missing(attempt, decoded):
         step, folder = attempt.step.id, attempt.recording.parent
         raise InputError(
             f"{attempt.recording}: step {step}: {lacks}; do this step again: "
             f"calib run --session {folder} --redo {step}"
         )
-    return heard
+    return decoded
 
 
-def _decoded(attempt: Attempt) -> _DecodedRecording:
-    """Decode a recording and cut it to what there is of the evidence."""
+def _decode(attempt: Attempt) -> _DecodedRecording:
+    """Decode a recording and cut it to the evidence that it contains."""
     recording = Recording(attempt.recording)
     layout = recording.profile.layout()
     decoder, tracker = FrameDecoder(layout), SequenceTracker(layout)
     pulses = [tracker.feed(decoder.feed(data)) for data in _wire(recording)]
     pulses.append(tracker.feed(decoder.close()))
-    heard = np.concatenate(pulses)
-    counter = heard["counter"]
+    samples = np.concatenate(pulses)
+    counter = samples["counter"]
     backward = np.flatnonzero(np.diff(counter) <= 0)  # the unit restarted before the evidence
     begin = int(backward[-1]) + 1 if len(backward) else 0
     counter = counter[begin:]
     if len(counter) and not begin:  # at a restart the service, too, begins with the unit's own number
         counter = counter + _offset(recording, attempt, int(counter[0]), 1 << layout.counter_bits)
     first, stop = np.searchsorted(counter, [attempt.first_counter, attempt.last_counter + 1])
-    return _DecodedRecording(heard[begin + first : begin + stop], counter[first:stop], layout, tracker.counts)
+    return _DecodedRecording(
+        samples[begin + first : begin + stop], counter[first:stop], layout, tracker.counts
+    )
 
 
 def _offset(recording: Recording, attempt: Attempt, first: int, period: int) -> int:
-    """What to add to the unit's counter, which may have wrapped before the recording, for the service's."""
+    """Return the service's count minus the unit's counter, which may have wrapped before the recording."""
     published = next((int(increments["counter"][0]) for increments in recording.increments()), first)
     published += _multiple(attempt.last_counter - published, _PUBLISHED_PERIOD)
     return _multiple(published - first, period)
 
 
 def _multiple(difference: int, period: int) -> int:
-    """Multiple of the period that is nearest to a difference."""
+    """Return the multiple of the period that is nearest to a difference."""
     return (2 * difference + period) // (2 * period) * period
 
 
-def _lacks(attempt: Attempt, heard: _DecodedRecording) -> str:
-    """Name the longest gap in the evidence, unless the line lost these samples.
+def _missing(attempt: Attempt, decoded: _DecodedRecording) -> str:
+    """Describe the longest gap in the evidence, unless the line lost these samples.
 
-    Where their number is not known, gaps of up to a block of 20 ms are taken for losses of the line: the
-    engine accepts no longer ones.
+    If the number of samples is unknown, gaps of up to a block of 20 ms are attributed to the line: the engine
+    accepts no longer ones.
     """
-    edges = np.concatenate([[attempt.first_counter - 1], heard.counter, [attempt.last_counter + 1]])
+    edges = np.concatenate([[attempt.first_counter - 1], decoded.counter, [attempt.last_counter + 1]])
     gaps = np.diff(edges) - 1
     longest = int(gaps.argmax())
     if attempt.samples is None:
-        is_whole = gaps[longest] <= BLOCK_NS // heard.layout.interval_ns
+        is_whole = gaps[longest] <= BLOCK_NS // decoded.layout.interval_ns
     else:
-        is_whole = len(heard.counter) == attempt.samples
+        is_whole = len(decoded.counter) == attempt.samples
     if is_whole:
         return ""
     return f"its recording does not cover counters {edges[longest] + 1}..{edges[longest + 1] - 1}"
 
 
 def _wire(recording: Recording) -> Iterator[bytes | Records]:
-    """The wire of a recording in larger pieces."""
+    """Yield the wire data of a recording in pieces of many reads."""
     arrivals = (arrival.data for arrival in recording.arrivals())
-    while pieces := list(islice(arrivals, _AT_ONCE)):
+    while pieces := list(islice(arrivals, _READS_PER_PIECE)):
         yield np.concatenate(pieces) if isinstance(pieces[0], np.ndarray) else b"".join(pieces)  # type: ignore[arg-type]

@@ -1,13 +1,13 @@
-"""The journal: what happened, one JSON object a line, only appended to, each line fsynced before it counts.
+"""Append-only journal of a session: one JSON object per line, synchronised to disk line by line.
 
-A line ends with its own hash, which the next line repeats, so that no line can be changed, taken out or put
-in unseen::
+Each line ends with its own hash and contains that of the line before, so that a line that is changed, removed
+or inserted is detected::
 
     {"event": ..., "at": UTC, ..., "before": hash of the line before, "sha256": hash of the text up to here}
 
-A power cut may leave the beginning of a line at the very end. It is dropped: what follows it is a line that
-is determined by what precedes it, with the length and hash of what was dropped, so that even a cut while that
-one is written leaves a journal to go on with. A broken line anywhere else is damage.
+A power cut may leave a partial line at the end of the file. The repair appends a line with the length and
+hash of that partial line, which is then ignored. The repair line depends only on what precedes it, so that a
+second power cut while it is written can be repaired as well. A partial line anywhere else is damage.
 """
 
 import hashlib
@@ -18,10 +18,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeAlias
 
+from calib.bench.entries import Entry, LineDropped, Plan, from_json, to_json
 from imudrv.errors import InputError
 
-Entry: TypeAlias = dict[str, Any]
-"""A line without its hashes."""
+_Line: TypeAlias = dict[str, Any]
 
 
 _HASH: Final = ', "sha256": "'
@@ -31,106 +31,98 @@ _HASH_BYTES: Final = len(_HASH) + 64 + len('"}')
 
 
 class PartialLine(NamedTuple):
-    """The beginning of a line at a journal's very end.
+    """A partial line at the end of a journal.
 
     Attributes
     ----------
     number : int
-        Of the line.
+        Line number.
     text : bytes
-        What there is of it.
-    mend : bytes
-        What has to be appended before the journal can go on.
+        The partial line.
+    repair : bytes
+        Bytes to append before the journal can be continued.
     """
 
     number: int
     text: bytes
-    mend: bytes
+    repair: bytes
 
     def __str__(self) -> str:
-        """What it is, for people."""
-        return (
-            f"line {self.number}, the last, is broken after {len(self.text)} bytes, as a power cut leaves it"
-        )
+        """Return a phrase for the user."""
+        return f"line {self.number}, the last, ends after {len(self.text)} bytes, as after a power cut"
 
 
 class Contents(NamedTuple):
-    """What a journal holds.
+    """Contents of a journal.
 
     Attributes
     ----------
-    entries : list of dict
-        Its whole lines.
+    entries : list of Entry
+        Its complete lines.
     last : str
         Hash of the last one.
-    torn : Torn or None
-        None: it ends with a whole line.
+    partial : PartialLine or None
+        None if the journal ends with a complete line.
     """
 
     entries: list[Entry]
     last: str
-    torn: PartialLine | None
+    partial: PartialLine | None
 
 
 class Journal:
-    """A journal that is open to be appended to.
+    """A journal that is open for appending.
 
     Parameters
     ----------
     path : Path
-        Of one that is there, see `begin`. A broken last line is dropped.
+        An existing journal, see `begin`. A partial last line is dropped.
 
     Attributes
     ----------
     dropped : str
-        What was dropped when it was opened; empty if nothing was.
+        Message about the line dropped on opening; empty if there was none.
 
     Raises
     ------
     InputError
-        It cannot be read or written, or a line is damaged: its number is told.
+        The journal cannot be read or written, or a line is damaged; the message gives its number.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._entries, self._last, torn = read(path)
+        self._entries, self._last, partial = read(path)
         self.dropped = ""
         try:
             self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC)
         except OSError as error:
             raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
-        if torn is not None:
-            self.dropped = f"{path}: {torn}; it is dropped"
-            self._write(torn.mend)
-            _, entry, self._last = _mend(torn.text, self._last)
+        if partial is not None:
+            self.dropped = f"{path}: {partial}; it is dropped"
+            self._write(partial.repair)
+            _, entry, self._last = _repair(partial.text, self._last)
             self._entries.append(entry)
 
     @property
     def entries(self) -> Sequence[Entry]:
-        """All lines so far."""
+        """All entries so far."""
         return self._entries
 
     def append(self, entry: Entry) -> None:
-        """Append a line; it is on the disk when this returns.
-
-        Parameters
-        ----------
-        entry : dict
-            Of what JSON knows; `event` says what happened.
+        """Append an entry; it is on disk when this returns.
 
         Raises
         ------
         InputError
-            It cannot be written.
+            The entry cannot be written.
         """
-        entry = _stamped(entry)
-        line, digest = _line(entry, self._last)
+        line, digest = _line(_stamped(entry), self._last)
         self._write(line)
         self._entries.append(entry)
         self._last = digest
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close the file."""
         os.close(self._file)
 
     def _write(self, data: bytes) -> None:
@@ -145,28 +137,28 @@ class Journal:
             ) from error
 
 
-def begin(path: Path, entry: Entry) -> None:
-    """Begin a journal.
+def begin(path: Path, plan: Plan) -> None:
+    """Create a journal.
 
     Parameters
     ----------
     path : Path
-        There must be no such file.
-    entry : dict
-        Its first line.
+        A file that does not exist yet.
+    plan : Plan
+        First entry.
 
     Raises
     ------
     InputError
-        It cannot be made.
+        The file cannot be created.
     """
     try:
         with path.open("xb") as file:
-            file.write(_line(_stamped(entry), "")[0])
+            file.write(_line(_stamped(plan), "")[0])
             file.flush()
             os.fsync(file.fileno())
     except OSError as error:
-        raise InputError(f"{path}: cannot be made: {error.strerror or error}") from error
+        raise InputError(f"{path}: cannot be created: {error.strerror or error}") from error
 
 
 def read(path: Path) -> Contents:
@@ -184,68 +176,74 @@ def read(path: Path) -> Contents:
     Raises
     ------
     InputError
-        It cannot be read, or a line is damaged: its number is told.
+        The journal cannot be read, or a line is damaged; the message gives its number.
     """
     try:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: expected a session's journal, cannot read it: {error.strerror}") from error
     entries: list[Entry] = []
-    last, torn = "", None
+    last, partial = "", None
     at, number = 0, 1
-    while at < len(data) and torn is None:
+    while at < len(data) and partial is None:
         end = data.find(b"\n", at)
-        line = data[at:] if end < 0 else data[at:end]
-        entry = _read_line(line) if end >= 0 else None
-        if entry is not None:
-            if entry.pop("before") != last:
+        text = data[at:] if end < 0 else data[at:end]
+        line = _read_line(text) if end >= 0 else None
+        if line is not None:
+            if line["before"] != last:
                 raise InputError(
                     f"{path}: line {number}: does not follow the line before it; "
-                    "one was changed, taken out or put in"
+                    "a line was changed, removed or inserted"
                 )
-            last = entry.pop("sha256")
-            entries.append(entry)
+            try:
+                entries.append(from_json(line))
+            except InputError as error:
+                raise InputError(f"{path}: line {number}: {error}") from None
+            last = line["sha256"]
             at, number = end + 1, number + 1
             continue
-        rest = data[at + len(line) :]
-        mend, mended, hash_of_mended = _mend(line, last)
-        if rest.startswith(mend):
-            entries.append(mended)
-            last = hash_of_mended
-            at, number = at + len(line) + len(mend), number + 2
-        elif mend.startswith(rest) and not _is_json(line):
-            torn = PartialLine(number, line, mend[len(rest) :])
+        rest = data[at + len(text) :]
+        repair, dropped, digest = _repair(text, last)
+        if rest.startswith(repair):
+            entries.append(dropped)
+            last = digest
+            at, number = at + len(text) + len(repair), number + 2
+        elif repair.startswith(rest) and not _is_json(text):
+            partial = PartialLine(number, text, repair[len(rest) :])
         else:
-            raise InputError(f"{path}: line {number}: is damaged: its text does not give its sha256")
+            raise InputError(f"{path}: line {number}: is damaged: its text does not match its sha256")
     if not entries:
-        raise InputError(f"{path}: expected the plan in line 1, got {len(data)} bytes without it; begin anew")
-    return Contents(entries, last, torn)
+        raise InputError(
+            f"{path}: expected the plan in line 1, got {len(data)} bytes without it; begin a new session"
+        )
+    return Contents(entries, last, partial)
 
 
-def _stamped(entry: Entry) -> Entry:
-    return {"event": entry["event"], "at": datetime.now(UTC).isoformat(timespec="milliseconds"), **entry}
+def _stamped(entry: Entry) -> _Line:
+    line = to_json(entry)
+    return {"event": line["event"], "at": datetime.now(UTC).isoformat(timespec="milliseconds"), **line}
 
 
-def _line(entry: Entry, before: str) -> tuple[bytes, str]:
-    """A line and its hash."""
-    text = json.dumps({**entry, "before": before}, allow_nan=False)[:-1]
+def _line(content: _Line, before: str) -> tuple[bytes, str]:
+    """Return the text of a line and its hash."""
+    text = json.dumps({**content, "before": before}, allow_nan=False)[:-1]
     digest = _sha256(text.encode())
     return f'{text}{_HASH}{digest}"}}\n'.encode(), digest
 
 
-def _read_line(line: bytes) -> Entry | None:
-    """A line, if it is whole."""
+def _read_line(line: bytes) -> _Line | None:
+    """Return the object of a line, None if its hash is wrong."""
     text, tail = line[:-_HASH_BYTES], line[-_HASH_BYTES:]
     if tail != f'{_HASH}{_sha256(text)}"}}'.encode():
         return None
-    entry: Entry = json.loads(line)
-    return entry
+    content: _Line = json.loads(line)
+    return content
 
 
-def _mend(torn: bytes, before: str) -> tuple[bytes, Entry, str]:
-    """What follows a torn line: the bytes from its end on, the line that they hold, and its hash."""
-    entry = {"event": "dropped", "bytes": len(torn), "sha256_of_dropped": _sha256(torn)}
-    line, digest = _line(entry, before)
+def _repair(partial: bytes, before: str) -> tuple[bytes, Entry, str]:
+    """Return what follows a partial line: the bytes after it, their entry, and its hash."""
+    entry = LineDropped(len(partial), _sha256(partial))
+    line, digest = _line(to_json(entry), before)
     return b"\n" + line, entry, digest
 
 

@@ -1,4 +1,4 @@
-"""The operator's keys."""
+"""Keyboard of the operator."""
 
 import os
 import select
@@ -18,9 +18,16 @@ _BY_STEP: Final[dict[str, Callable[[str], Action]]] = {"confirm": Confirm, "redo
 
 
 class Keyboard:
-    """Keys, and what they ask for; Ctrl-C stays the system's.
+    """Keys of the terminal, and the actions they stand for; Ctrl-C keeps its usual effect.
 
-    Where standard input is no terminal there are none.
+    There are none if standard input is no terminal.
+
+    Attributes
+    ----------
+    there : bool
+        Whether there is a terminal.
+    asks : bool
+        Whether an abort has to be confirmed by another key.
     """
 
     def __init__(self) -> None:
@@ -42,19 +49,19 @@ class Keyboard:
             termios.tcsetattr(self._fd, termios.TCSADRAIN, self._before)
 
     def read(self) -> str:
-        """What was typed since the last time; a key that sends more than a character is left out."""
+        """Return the keys typed since the last call; escape sequences are ignored."""
         if not self.there or not select.select([self._fd], [], [], 0.0)[0]:
             return ""
         typed = os.read(self._fd, 1024).decode(errors="replace")
         return "" if typed.startswith("\x1b") else typed.lower()
 
     def action(self, view: View) -> Action | None:
-        """What was asked for, if it makes sense now; an abort only once it was asked for again.
+        """Return the action of the keys typed, if it is possible now; an abort must be repeated.
 
         Parameters
         ----------
         view : View
-            What the operator sees.
+            View that the operator sees.
 
         Returns
         -------

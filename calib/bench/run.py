@@ -2,7 +2,8 @@
 
 import os
 import tempfile
-from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from threading import Thread
@@ -11,11 +12,14 @@ from typing import Final
 from rich.console import Console
 
 from calib.bench.controller import SessionController
+from calib.bench.entries import EmbeddedFile
 from calib.bench.keys import Keyboard
 from calib.bench.queue_sink import QueueSink
+from calib.bench.resume import check_files, require_same, resume
 from calib.bench.screen import OperatorScreen
-from calib.bench.session import JOURNAL, REPORT, WORKING_CERTIFICATE, EmbeddedFile, Session
-from calib.bench.simulated_unit import SimulatedUnitProcess
+from calib.bench.session import Session
+from calib.bench.simulated_unit import SimulatedUnitProcess, is_rehearsal
+from calib.bench.state import JOURNAL, REPORT, WORKING_CERTIFICATE
 from calib.procedure.plan import load_file, predicted
 from calib.procedure.schema import Procedure
 from imudrv import profiles
@@ -29,54 +33,78 @@ from imudrv.terminal import INTERRUPTED, OK
 from imudrv.units import MM
 
 PROCEDURE: Final = "three-rotations"
-"""Unless told otherwise."""
+"""Default procedure."""
 
 
-REHEARSED: Final = "imu50-rs422"
-"""Profile of a rehearsal unless told otherwise."""
+REHEARSAL_PROFILE: Final = "imu50-rs422"
+"""Default profile of a rehearsal."""
 
 
-AHEAD: Final = 1000
-"""Samples that may wait for the engine where the unit waits for its reader."""
+QUEUE_LIMIT: Final = 1000
+"""Samples that may wait for the engine in a rehearsal at full speed."""
 
 
-def run(
-    *,
-    port: str | None = None,
-    profile: str | None = None,
-    calibration: Path | None = None,
-    site: Path | None = None,
-    procedure: str | None = None,
-    folder: Path | None = None,
-    hands_free: bool = False,
-    rehearse: bool = False,
-    speed: str = "1",
-    redo: Sequence[str] = (),
-    console: Console,
-) -> int:
-    """Lead through a session, a new one or one that is there.
+@dataclass(frozen=True)
+class RunOptions:
+    """Options of `calib run`.
+
+    Attributes
+    ----------
+    folder : Path
+        Folder of the session. An existing session is resumed: options that are not given are as it began,
+        those that are given must be the same.
+    port, profile : str or None
+        Port of the unit, and its wire format.
+    calibration, site : Path or None
+        The unit's active certificate, and the site of the bench.
+    procedure : str or None
+        Name or path; None: `PROCEDURE`.
+    hands_free : bool
+        Proceed by the sensors alone, without keys.
+    rehearse : bool
+        Use a simulated unit and technician, hands free.
+    speed : str
+        Speed of the rehearsal: a number, or ``max``.
+    redo : tuple of str
+        Steps of an existing session to do again.
+    """
+
+    folder: Path
+    port: str | None = None
+    profile: str | None = None
+    calibration: Path | None = None
+    site: Path | None = None
+    procedure: str | None = None
+    hands_free: bool = False
+    rehearse: bool = False
+    speed: str = "1"
+    redo: tuple[str, ...] = ()
+
+    @property
+    def is_rehearsal(self) -> bool:
+        """Whether the session has a simulated unit, now or when it began."""
+        return self.rehearse or is_rehearsal(self.folder)
+
+    @property
+    def has_operator(self) -> bool:
+        """Whether an operator presses keys."""
+        return not (self.hands_free or self.is_rehearsal)
+
+
+def new_folder() -> Path:
+    """Return the default folder of a new session, named by the time."""
+    return Path(f"session-{datetime.now(UTC):%Y%m%dT%H%M%SZ}")
+
+
+def run(options: RunOptions, console: Console) -> int:
+    """Conduct a new or an existing session.
 
     Parameters
     ----------
-    port, profile : str or None
-        Where the unit is, and what it sends.
-    calibration, site : Path or None
-        The unit's active certificate, and where it stands.
-    procedure : str or None
-        Name or path; `PROCEDURE` if it is not given.
-    folder : Path or None
-        Of the session; a new one by the time if it is not given. A session that is there is resumed: what is
-        not given is then as it began, what is given must be the same.
-    hands_free : bool
-        Go on by the sensors alone.
-    rehearse : bool
-        With a simulated unit and technician, hands free.
-    speed : str
-        Of the rehearsal: a number, or ``max``.
-    redo : sequence of str
-        Steps of a session that is there, to be done again.
+    options : RunOptions
+        Options of the command.
     console : Console
-        Where it is shown.
+        The operator's terminal.
 
     Returns
     -------
@@ -86,63 +114,35 @@ def run(
     Raises
     ------
     InputError
-        Something that is given cannot be, or the session cannot be resumed; says why.
+        An option is invalid, or the session cannot be resumed; the message says why.
     """
-    folder = folder or Path(f"session-{datetime.now(UTC):%Y%m%dT%H%M%SZ}")
-    is_there = (folder / JOURNAL).exists()
-    keys = Keyboard()
-    rehearsal = SimulatedUnitProcess(folder, speed) if rehearse or SimulatedUnitProcess.was(folder) else None
-    if rehearsal is None and not hands_free and not keys.there:
-        raise InputError("expected a terminal for the operator's keys, got none; use one, or --hands-free")
-    if rehearsal is not None and (port or calibration or site):
-        raise InputError("--rehearse: expected no --port, --calibration or --site; it has a unit of its own")
-    if is_there and rehearse and not SimulatedUnitProcess.was(folder):
-        raise InputError(f"{folder}: expected a rehearsal to go on with, got the session of a unit")
-    if redo and not is_there:
-        raise InputError(f"--redo: expected a session that is there, with --session, got none in {folder}")
-    if is_there:
-        session = Session.open(folder)
-    else:
-        wanted = load_file(procedure or PROCEDURE)
-        if rehearsal is not None:
-            port, calibration, site = rehearsal.make(wanted.model)
-            profile = profile or REHEARSED
-        if port is None or profile is None or calibration is None or site is None:
-            raise InputError("a new session: expected --port, --profile, --calibration and --site")
-        place = settings_file.read_file(site, Site)
-        worst_mm = float(predicted(wanted.model, place.model).differences_sigma.max()) / MM
-        expected = f"session {folder}: the differences are expected to 1 sigma of {worst_mm:.3f} mm"
-        console.print(expected, markup=False, soft_wrap=True)
-        session = Session.create(
-            folder,
-            procedure=_document(procedure or PROCEDURE, wanted.content),
-            calibration=calibration,
-            site=_document(site, place.content),
-            profile=profile,
-            port=port,
-        )
+    with closing(open_or_create(options, console)) as session:
+        return conduct(session, options, console)
+
+
+def open_or_create(options: RunOptions, console: Console) -> Session:
+    """Resume the session of the options, or create it; see `run`."""
+    exists = (options.folder / JOURNAL).exists()
+    _check(options, exists)
+    if not exists:
+        return _create(options, console)
+    session = Session.open(options.folder)
     try:
-        if is_there:
-            _require_resumable(session, procedure, calibration, site, profile)
-            _resume(session, console, redo, asks=rehearsal is None and not hands_free)
-        return _conducted(session, port or session.plan.port, keys, rehearsal, hands_free, console)
-    finally:
+        _require_resumable(session, options)
+        resume(session, console, options.redo, asks=options.has_operator)
+    except BaseException:
         session.close()
+        raise
+    return session
 
 
-def _conducted(
-    session: Session,
-    port: str,
-    keys: Keyboard,
-    rehearsal: SimulatedUnitProcess | None,
-    hands_free: bool,
-    console: Console,
-) -> int:
+def conduct(session: Session, options: RunOptions, console: Console) -> int:
+    """Conduct an open session: the service runs in this thread, the controller in another; see `run`."""
     plan = session.plan
-    layout = profiles.load(plan.profile.name).layout()
-    tap = QueueSink(AHEAD if rehearsal is not None and rehearsal.waits else None)
+    simulated = SimulatedUnitProcess(session.folder, options.speed) if options.is_rehearsal else None
+    queue = QueueSink(QUEUE_LIMIT if simulated is not None and simulated.waits else None)
     settings = Settings(
-        port=port,
+        port=options.port or plan.port,
         profile=plan.profile.name,
         calibration=str(session.folder / WORKING_CERTIFICATE),
         unit=plan.unit,
@@ -150,73 +150,93 @@ def _conducted(
     )
     service = Service(
         settings,
-        lambda text: tap.tell(text.partition(" ")[2]),
-        [tap],
-        in_real_time=rehearsal is None,
+        lambda text: queue.put_message(text.partition(" ")[2]),
+        [queue],
+        in_real_time=simulated is None,
         history=History(),
     )
 
     def begin(steps: Procedure) -> None:
-        if rehearsal is not None:
-            rehearsal.begin(steps, plan.profile.name)
+        if simulated is not None:
+            simulated.begin(steps, plan.profile.name)
 
-    conduct = SessionController(
+    controller = SessionController(
         session,
-        session.procedure(),
-        layout,
+        profiles.load(plan.profile.name).layout(),
         service,
-        tap,
+        queue,
         OperatorScreen(console),
-        keys,
-        hands_free=hands_free or rehearsal is not None,
+        Keyboard(),
+        hands_free=not options.has_operator,
         begin=begin,
     )
-    worker = Thread(target=conduct.run, name="conduct")
+    worker = Thread(target=controller.run, name="controller")
     worker.start()
     try:
         service.run()
     finally:
-        tap.close()
+        queue.close()
         worker.join()
-        if rehearsal is not None:
-            rehearsal.end()
-        if not conduct.outcome:
-            console.print(f"accepted so far: {', '.join(session.accepted) or 'no step'}", markup=False)
-            console.print(f"go on with: calib run --session {session.folder}", markup=False, soft_wrap=True)
-    if conduct.error is not None:
-        raise conduct.error
-    if not conduct.outcome:
+        if simulated is not None:
+            simulated.end()
+        if not controller.outcome:
+            console.print(f"accepted steps: {', '.join(session.accepted) or 'none'}", markup=False)
+            console.print(f"resume with: calib run --session {session.folder}", markup=False, soft_wrap=True)
+    if controller.error is not None:
+        raise controller.error
+    if not controller.outcome:
         return INTERRUPTED
-    console.print(conduct.outcome, markup=False, highlight=False, soft_wrap=True)
+    console.print(controller.outcome, markup=False, highlight=False, soft_wrap=True)
     return OK
 
 
-def _require_resumable(
-    session: Session, procedure: str | None, calibration: Path | None, site: Path | None, profile: str | None
-) -> None:
-    if session.is_over:
-        raise InputError(f"{session.folder}: the session is over, see {REPORT} in it; name another folder")
-    session.require_whole()
-    session.require_same(
-        procedure=_document(procedure, load_file(procedure).content) if procedure else None,
+def _check(options: RunOptions, exists: bool) -> None:
+    """Refuse options that do not fit together."""
+    folder = options.folder
+    if options.has_operator and not Keyboard().there:
+        raise InputError("expected a terminal for the operator's keys, got none; use one, or --hands-free")
+    if options.is_rehearsal and (options.port or options.calibration or options.site):
+        raise InputError("--rehearse: expected no --port, --calibration or --site; it has a unit of its own")
+    if exists and options.rehearse and not is_rehearsal(folder):
+        raise InputError(f"{folder}: --rehearse: expected a rehearsal to resume, got the session of a unit")
+    if options.redo and not exists:
+        raise InputError(f"--redo: expected an existing session, with --session, got none in {folder}")
+
+
+def _create(options: RunOptions, console: Console) -> Session:
+    """Create a session, and print the expected accuracy of its procedure."""
+    folder, name = options.folder, options.procedure or PROCEDURE
+    procedure = load_file(name)
+    port, calibration, site, profile = options.port, options.calibration, options.site, options.profile
+    if options.is_rehearsal:
+        port, calibration, site = SimulatedUnitProcess(folder, options.speed).make(procedure.model)
+        profile = profile or REHEARSAL_PROFILE
+    if port is None or profile is None or calibration is None or site is None:
+        raise InputError("a new session: expected --port, --profile, --calibration and --site")
+    place = settings_file.read_file(site, Site)
+    worst_mm = float(predicted(procedure.model, place.model).differences_sigma.max()) / MM
+    expected = f"session {folder}: expected accuracy of the differences: {worst_mm:.3f} mm (1 sigma)"
+    console.print(expected, markup=False, soft_wrap=True)
+    return Session.create(
+        folder,
+        procedure=EmbeddedFile.of(name, procedure.content),
         calibration=calibration,
-        site=_document(site, settings_file.read_file(site, Site).content) if site else None,
-        profile=profile or session.plan.profile.name,
+        site=EmbeddedFile.of(site, place.content),
+        profile=profile,
+        port=port,
     )
 
 
-def _resume(session: Session, console: Console, redo: Sequence[str], asks: bool) -> None:
-    """Say where the session was, ask whether to go on there, and clear up."""
-    lines = [session.dropped] if session.dropped else []
-    accepted = ", ".join(session.accepted) or "no step yet"
-    lines.append(f"session {session.folder} of unit {session.plan.unit}: accepted {accepted}")
-    console.print("\n".join(lines), markup=False, soft_wrap=True)
-    if asks and console.input("go on there? \\[y/n] ").strip().lower() not in ("y", "yes"):
-        raise InputError(f"{session.folder}: left as it is; name another folder for a new session")
-    session.redo(redo)
-    left = session.enter_leftovers()
-    session.append({"event": "resumed", "left": left})
-
-
-def _document(name: str | Path, content: bytes) -> EmbeddedFile:
-    return EmbeddedFile(str(name), content.decode())
+def _require_resumable(session: Session, options: RunOptions) -> None:
+    """Refuse a session that is over, damaged, or began with other files."""
+    if session.is_over:
+        raise InputError(f"{session.folder}: the session is over, see {REPORT} in it; name another folder")
+    check_files(session)
+    procedure, site = options.procedure, options.site
+    require_same(
+        session,
+        procedure=EmbeddedFile.of(procedure, load_file(procedure).content) if procedure else None,
+        calibration=options.calibration,
+        site=EmbeddedFile.of(site, settings_file.read_file(site, Site).content) if site else None,
+        profile=options.profile or session.plan.profile.name,
+    )

@@ -1,4 +1,4 @@
-"""The bench's screen and keys: what to do now, readable from two metres; a function of the engine's `View`.
+"""Operator's screen: the current instruction, readable from two metres; a function of the engine's `View`.
 
 On a terminal the screen is redrawn in place; elsewhere (a pipe, ``TERM=dumb``) each change is a line.
 """
@@ -20,16 +20,16 @@ from calib.procedure.events import Phase, View
 from calib.procedure.messages import english, message, verbatim
 from imudrv.diagnosis import LineState
 
-UNHEARD: Final = message("no_data")
-"""Headline while nothing comes from the unit."""
+NO_DATA: Final = message("no_data")
+"""Headline while no data arrive from the unit."""
 
 
-UNREADABLE: Final = message("no_frames")
-"""Headline while what comes is not what the profile says."""
+NO_FRAMES: Final = message("no_frames")
+"""Headline while the data contain no frame of the profile."""
 
 
 _OTHER_ROWS: Final = 8
-"""Rows beside headline, hints and reasons; one is left free, for a terminal that scrolls behind the last."""
+"""Rows besides headline, hints and reasons; one stays free for terminals that scroll after the last row."""
 
 
 _FEWEST: Final = 2
@@ -39,7 +39,7 @@ _MOST_HINTS: Final = 3
 
 
 _MOST_REASONS: Final = 5
-"""Rows of hints and reasons; so few that the headline keeps its room."""
+"""Limits on the rows of hints and reasons, so that the headline keeps its space."""
 
 
 _NAMES: Final = {"confirm": "Enter", "redo": "r", "skip": "s", "abort": "q"}
@@ -59,42 +59,42 @@ _STYLES: Final = {
 
 
 def with_port_state(view: View, state: LineState) -> View:
-    """Add what is wrong with the line to a view; without samples that is the headline.
+    """Add a fault of the line to a view; without samples it becomes the headline.
 
     Parameters
     ----------
     view : View
-        From the engine.
+        View of the engine.
     state : LineState
-        From the service.
+        State of the line, from the service.
 
     Returns
     -------
     View
-        The same if nothing is wrong.
+        The same view if there is no fault.
     """
     if not state.trouble:
         return view
-    headlines = {"streaming": view.headline, "unreadable": UNREADABLE}
-    headline = headlines.get(state.name, UNHEARD)
+    headlines = {"streaming": view.headline, "unreadable": NO_FRAMES}
+    headline = headlines.get(state.name, NO_DATA)
     return replace(view, headline=headline, reasons=(verbatim(str(state)), *view.reasons))
 
 
 def screen(
     view: View, width: int, height: int, question: str = "", ascii_only: bool = False
 ) -> RenderableType:
-    """Draw a view; fits 80 columns and 24 lines.
+    """Draw a view; it fits 80 columns and 24 lines.
 
     Parameters
     ----------
     view : View
-        Of the engine.
+        View of the engine.
     width, height : int
-        Of the terminal, cells.
+        Size of the terminal, cells.
     question : str
-        In the place of the keys.
+        Question to show instead of the keys.
     ascii_only : bool
-        The terminal knows no blocks.
+        The terminal has no block characters.
 
     Returns
     -------
@@ -119,27 +119,27 @@ def screen(
 
 
 def plain(view: View, question: str = "") -> str:
-    """A view in a line; what changes all the time is left out."""
+    """Return a view as one line, without the values that change continuously."""
     parts = [english(view.title), f"{view.phase.value}: {english(view.headline)}", *map(english, view.hints)]
     parts += [f"! {reason}" for reason in (*map(english, view.reasons), question) if reason]
     return " | ".join(part for part in parts if part)
 
 
 class OperatorScreen:
-    """Where views are shown.
+    """Screen that shows views and text.
 
-    A thread of its own writes, so that nobody waits for a terminal that is stopped (Ctrl-S) or for a slow
-    line. A view that has not been written yet is replaced by the next one; lines of text are kept, in order.
+    A thread of its own writes, so that no caller waits for a stopped terminal (Ctrl-S) or a slow connection.
+    A view that has not been written yet is replaced by the next one; lines of text are kept, in order.
 
     Parameters
     ----------
     console : Console
-        Of rich. Without a terminal, or on a dumb one, it gets plain lines.
+        Console of rich. Without a terminal, or on a dumb one, it receives plain lines.
 
     Attributes
     ----------
     shown : View or None
-        The newest view that has been written: the one that the operator's keys refer to.
+        Newest view that has been written: the operator's keys refer to it.
     """
 
     def __init__(self, console: Console) -> None:
@@ -165,14 +165,14 @@ class OperatorScreen:
         Parameters
         ----------
         view : View
-            Of the engine.
+            View of the engine.
         question : str
-            In the place of the keys.
+            Question to show instead of the keys.
 
         Raises
         ------
         OSError
-            The terminal cannot be written to any more.
+            The terminal can no longer be written to.
         """
         text = plain(view, question) if self._is_plain else ""
         if self._newest_view is not None and text == self._newest_text:
@@ -181,11 +181,11 @@ class OperatorScreen:
         self._newest_view = self._submit(partial(self._draw, view, question))
 
     def print(self, what: RenderableType) -> None:
-        """Take the screen away and print something that stays."""
+        """Leave the full-screen view and print permanent text."""
         self._submit(partial(self._print, what))
 
     def close(self) -> None:
-        """Write what waits, however long the terminal takes, and give it back."""
+        """Write everything that waits, however long the terminal takes, and restore the terminal."""
         self._writer.submit(self._leave)
         self._writer.shutdown()
 
@@ -196,11 +196,11 @@ class OperatorScreen:
         self._newest = self._writer.submit(write)
         return self._newest
 
-    # In the thread that writes
+    # Methods of the writing thread
 
     def _draw(self, view: View, question: str) -> None:
         if self._is_plain:
-            self._say(plain(view, question))
+            self._print_line(plain(view, question))
         else:
             if view.bells > self._bells:
                 self._console.bell()
@@ -213,8 +213,8 @@ class OperatorScreen:
             self._live.update(screen(view, size.width, size.height, question, ascii_only), refresh=True)
         self.shown = view
 
-    def _say(self, text: str) -> None:
-        """Print a line, unless it was the last one."""
+    def _print_line(self, text: str) -> None:
+        """Print a line unless it repeats the last one."""
         if text != self._last:
             self._console.print(text, markup=False, highlight=False, soft_wrap=True)
             self._last = text
@@ -235,7 +235,7 @@ def _time(seconds: float | None) -> str:
 
 def _banner(view: View, width: int, height: int, ascii_only: bool) -> RenderableType:
     refused = view.reasons and view.phase in (Phase.PREFLIGHT, Phase.PLACE, Phase.VERDICT)
-    style = "white on red" if refused or view.headline in (UNHEARD, UNREADABLE) else _STYLES[view.phase]
+    style = "white on red" if refused or view.headline in (NO_DATA, NO_FRAMES) else _STYLES[view.phase]
     headline, inside = english(view.headline), width - 2
     scale, lines = block_letters.fitted(headline, inside, height)
     if ascii_only and scale < 2:
@@ -252,7 +252,7 @@ def _banner(view: View, width: int, height: int, ascii_only: bool) -> Renderable
 
 
 def _wrapped(texts: Sequence[str], width: int, fewest: int, most: int) -> list[str]:
-    """Rows of texts, each beginning on a row of its own; what is over ends with an ellipsis."""
+    """Wrap texts into rows, each text on a new row; an ellipsis stands for rows beyond the limit."""
     rows = [row for text in texts for row in textwrap.wrap(text, width)]
     if len(rows) > most:
         rows = [*rows[: most - 1], textwrap.shorten(" ".join(rows[most - 1 :]), width, placeholder=" ...")]
@@ -260,7 +260,7 @@ def _wrapped(texts: Sequence[str], width: int, fewest: int, most: int) -> list[s
 
 
 def _figures(view: View, width: int, ascii_only: bool) -> RenderableType:
-    """Live bars: angle, rate, stillness, time, and the sigmas."""
+    """Return the bars of angle, rate, stillness and progress, and the sigmas."""
     room = width - 10 - 24
     full = view.want_deg or 180.0
     angle = "" if view.angle_deg is None else f"{view.angle_deg:+.1f} of {full:+.0f} deg"
@@ -278,7 +278,7 @@ def _figures(view: View, width: int, ascii_only: bool) -> RenderableType:
         "still",
         view.stillness,
         "green" if view.stillness > 0.8 else "red",
-        "" if view.stillness > 0.8 else "moves",
+        "" if view.stillness > 0.8 else "moving",
     )
     add("progress", view.progress, "yellow", _percent(view.progress))
     sigmas = [

@@ -1,8 +1,9 @@
-"""The technician that is not there: a procedure, mistakes if you like, as a scenario of the simulated unit.
+"""Simulated technician: turns a procedure, with optional mistakes, into a motion scenario.
 
-The technician sets the unit down in the first pose, waits for the preflight, and for each step carries it
-into its pose, rests, turns it, rests; hands tremble while they carry. A mistake is made in its step, what the
-engine says is heeded, and the step is done again. The times are those of the engine with `hands_free`.
+The technician sets the unit down in the first pose and waits for the preflight. For each step the unit is
+carried into its pose, rests, is rotated, and rests again; hands tremble while they carry. After a mistake the
+technician follows the engine's instructions and repeats the step. Times are those of the engine with
+`hands_free`.
 """
 
 from collections.abc import Sequence
@@ -43,33 +44,34 @@ Kind = Literal["moves", "wrong way", "short", "slow", "wrong pose", "bump", "unp
 
 
 BENCH: Final = Site(latitude_deg=28.2, longitude_deg=113.0, height_m=60.0)
-"""Where the rehearsal takes place."""
+"""Site of the rehearsal."""
 
 
 REACTION_S: Final = 4.0
-"""From the engine's word to the deed, s."""
+"""Time from the engine's instruction to the action, s."""
 
 
 CARRY_DEG_PER_S: Final = 45.0
-"""Mean rate of a unit that is carried into another pose."""
+"""Mean rate while the unit is carried into another pose."""
 
 
 ARM_MM: Final = 18.0
-"""Sensing points are drawn so far from their centroid along each axis, 1 sigma."""
+"""Distance of the random sensing points from their centroid along each axis, 1 sigma."""
 
 
 @dataclass(frozen=True)
 class Mistake:
-    """What goes wrong in a step.
+    """A mistake in a step.
 
     Attributes
     ----------
     step_id : str
         The step.
     kind : str
-        'moves': touches the unit during the alignment. 'wrong way': turns it the other way first. 'short':
-        150 deg only. 'slow': in 8 s. 'wrong pose': puts another side up first. 'bump': bumps the bench in the
-        rest after the turn. 'unplug': the cable comes out for 3 s during the alignment.
+        'moves': touches the unit during the alignment. 'wrong way': rotates in the wrong direction first.
+        'short': rotates by 150 deg only. 'slow': takes 8 s. 'wrong pose': puts another side up first. 'bump':
+        bumps the bench during the rest after the rotation. 'unplug': unplugs the cable for 3 s during the
+        alignment.
     """
 
     step_id: str
@@ -84,30 +86,30 @@ def technician_scenario(
     site: Site = BENCH,
     calibration: Calibration | None = None,
 ) -> Scenario:
-    """Make the scenario of a procedure carried out by hand.
+    """Return the scenario of a procedure carried out by hand.
 
     Parameters
     ----------
     procedure : Procedure
-        What is carried out.
+        The procedure.
     mistakes : sequence of Mistake
-        What goes wrong on the way; one a step at the most. Each is made good.
+        At most one per step; the step is repeated after it.
     seed : int
-        Draws the unit's errors, its arms, and how the technician's hands go.
+        Random seed of the unit's errors, its lever arms, and the technician's hands.
     site : Site
-        Where.
+        Site of the bench.
     calibration : Calibration, optional
-        Certificate of the unit; its `size_effect` is the truth. Not given: the nominal unit with drawn arms.
+        Certificate of the unit; its `size_effect` is the truth. Default: `true_calibration` of the seed.
 
     Returns
     -------
     Scenario
-        `unit.calibration` is the certificate with the true arms; the engine is to get it without them.
+        `unit.calibration` is the certificate with the true lever arms; the engine must get it without them.
 
     Raises
     ------
     InputError
-        A mistake in a step that there is not, or two in one.
+        A mistake in a step that does not exist, or two in one step.
     """
     kinds = {mistake.step_id: mistake.kind for mistake in mistakes}
     known = [step.id for step in procedure.steps]
@@ -117,7 +119,7 @@ def technician_scenario(
             f"got {', '.join(m.step_id for m in mistakes)}"
         )
     rng = np.random.default_rng(seed)
-    calibration = calibration or _drawn(rng)
+    truth = _draw_lever_arms(rng) if calibration is None else calibration
     hands = _MotionScript(procedure, rng)
     for step in procedure.steps:
         hands.do(step, kinds.get(step.id))
@@ -130,7 +132,7 @@ def technician_scenario(
         start=hands.start,
         motion=tuple(hands.motion),
         unit=Unit(
-            calibration=calibration,
+            calibration=truth,
             residuals=Residuals(
                 gyro_bias_deg_per_h=0.01,
                 gyro_scale_ppm=5.0,
@@ -145,8 +147,13 @@ def technician_scenario(
     )
 
 
-def _drawn(rng: np.random.Generator) -> Calibration:
-    """Draw the nominal unit's arms, in gauge centroid."""
+def true_calibration(seed: int) -> Calibration:
+    """Return the nominal unit with random lever arms, as `technician_scenario` simulates it."""
+    return _draw_lever_arms(np.random.default_rng(seed))
+
+
+def _draw_lever_arms(rng: np.random.Generator) -> Calibration:
+    """Draw the nominal unit's lever arms, in gauge centroid."""
     r_mm = np.round(rng.normal(0.0, ARM_MM, (3, 3)), 3)
     r_mm[2] = -r_mm[0] - r_mm[1]
     x, y, z = (tuple(row) for row in np.round(r_mm, 3).tolist())
@@ -155,7 +162,7 @@ def _drawn(rng: np.random.Generator) -> Calibration:
 
 
 class _MotionScript:
-    """The technician's hands: what they do becomes the motion."""
+    """Motion segments of the technician's actions."""
 
     def __init__(self, procedure: Procedure, rng: np.random.Generator) -> None:
         self._procedure, self._rng = procedure, rng
@@ -170,14 +177,14 @@ class _MotionScript:
         self.rest(PREFLIGHT_S + REACTION_S)
 
     def do(self, step: Step, mistake: Kind | None) -> None:
-        """Carry a step out."""
+        """Carry out a step."""
         turn_s = TURN_S * self._rng.uniform(0.9, 1.1)
         turn_deg = step.turn_deg + self._rng.uniform(-1.5, 1.5)
         sign = np.sign(step.turn_deg)
         if mistake == "wrong pose":
             self._carry(self._wrong_pose(step))
             self.rest(2.0 * REACTION_S)
-        if not self._stands(step):
+        if not self._is_in_pose(step):
             self._carry(self._pose(step))
         before_s = READY_S + self._procedure.limits.still_s
         if mistake == "moves":
@@ -206,7 +213,7 @@ class _MotionScript:
         self.rest(step.rest_s + REACTION_S)
 
     def rest(self, duration_s: float) -> None:
-        """Keep off."""
+        """Leave the unit alone."""
         self._add(Segment(rest=Rest(duration_s=duration_s)), duration_s)
 
     def _align(self, step: Step) -> None:
@@ -214,7 +221,7 @@ class _MotionScript:
         self.rest(READY_S + limits.still_s + step.align_s + REACTION_S)
 
     def _turn(self, angle_deg: float, duration_s: float) -> None:
-        """Turn about the vertical, or nearly so."""
+        """Rotate about the vertical, within a hand's accuracy."""
         lean = self._rng.normal(0.0, 2.0, 2) * 1e-3
         axis = (float(lean[0]), float(lean[1]), 1.0)
         self._about(axis, angle_deg, duration_s)
@@ -225,7 +232,7 @@ class _MotionScript:
         self._C_nb = rotation(axis_n, radians(angle_deg)) @ self._C_nb
 
     def _carry(self, C_nb: Array) -> None:
-        """Lift the unit, turn it, and set it down."""
+        """Lift the unit, rotate it, and set it down."""
         self._tremble()
         turn = Attitude.from_matrix(C_nb @ self._C_nb.T).as_rotvec()
         angle = float(np.linalg.norm(turn))
@@ -248,25 +255,25 @@ class _MotionScript:
         self._t_s += duration_s
 
     def _pose(self, step: Step) -> Array:
-        """The pose of a step, as well as a person sets it down."""
+        """Return the attitude in which a person sets the unit down for a step."""
         heading = rotation((0.0, 0.0, 1.0), radians(self._rng.uniform(-8.0, 8.0)))
         lean = Attitude.from_rotvec([*(self._rng.normal(0.0, 1e-3, 2)), 0.0]).as_matrix()
         C_nb: Array = lean @ heading @ step.C_bn.T
         return C_nb
 
     def _wrong_pose(self, step: Step) -> Array:
-        """Another side up: the one that should look north."""
+        """Return a pose with another side up: the one that should face north."""
         C_nb: Array = rotation((1.0, 0.0, 0.0), radians(90.0)) @ self._pose(step)
         return C_nb
 
-    def _stands(self, step: Step) -> bool:
-        """Whether the unit stands as the step wants it."""
+    def _is_in_pose(self, step: Step) -> bool:
+        """Return whether the unit is in the pose of a step."""
         off = Attitude.from_matrix(self._C_nb @ step.C_bn)
         return bool(off.magnitude() < radians(20.0))
 
 
 def _start(step: Step, C_nb: Array) -> Start:
-    """Where the unit stands at first: in the step's pose, or Z up where that side is underneath."""
+    """Return the initial pose: that of the step, or Z up if the step has a negative axis up."""
     pose: Literal["x_up", "y_up", "z_up"]
     pose = {"X": "x_up", "Y": "y_up", "Z": "z_up"}[side(step.up)[-1]]  # type: ignore[assignment]
     pivot_offset_mm = (40.0, 30.0, 30.0)

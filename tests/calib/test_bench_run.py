@@ -17,12 +17,14 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from calib.bench.evidence import Attempt, identify
+from calib.bench.entries import Plan, from_json
+from calib.bench.evidence import identify, identify_session
 from calib.bench.journal import Journal, begin
-from calib.bench.run import run
-from calib.bench.session import JOURNAL, Session
+from calib.bench.run import RunOptions, run
+from calib.bench.session import Session
 from calib.bench.simulated_unit import SEED
-from calib.bench.technician import BENCH, technician_scenario
+from calib.bench.state import JOURNAL, Attempt
+from calib.bench.technician import BENCH, true_calibration
 from calib.bench.verify import verify
 from calib.identification import PriorCalibration
 from calib.procedure.plan import load, predicted
@@ -35,7 +37,7 @@ from imudrv.records import Source
 from imudrv.sim.scenario import NOMINAL
 from imudrv.sinks.recorder import Recorder
 
-# The alignment is short: of what follows from it, heading and biases, the joint estimate finds most anew.
+# The alignment is short: the joint estimate determines most of heading and biases again.
 PROCEDURE = """
 format: imu50-procedure
 version: 1
@@ -53,22 +55,16 @@ RUN = """
 import sys
 from pathlib import Path
 from rich.console import Console
-from calib.bench.run import run
+from calib.bench.run import RunOptions, run
 from imudrv.terminal import guarded
 procedure, folder, *redo = sys.argv[1:]
-sys.exit(guarded(lambda: run(
-    procedure=procedure,
-    folder=Path(folder),
-    rehearse=True,
-    speed="max",
-    redo=redo,
-    console=Console(width=200),
-)))
+options = RunOptions(Path(folder), procedure=procedure, rehearse=True, speed="max", redo=tuple(redo))
+sys.exit(guarded(lambda: run(options, Console(width=200))))
 """
 
 
 def start(folder: Path, *redo: str) -> subprocess.Popen[str]:
-    """Begin a rehearsal, or go on with it."""
+    """Begin or resume a rehearsal."""
     procedure = folder.parent / "short.yaml"
     procedure.write_text(PROCEDURE)
     return subprocess.Popen(
@@ -81,14 +77,14 @@ def start(folder: Path, *redo: str) -> subprocess.Popen[str]:
 
 
 def journal(folder: Path) -> list[dict[str, Any]]:
-    """Whole lines of the journal; it may be written to meanwhile."""
+    """Complete lines of the journal, which may be growing."""
     path = folder / JOURNAL
     text = path.read_text() if path.exists() else ""
     return [json.loads(line) for line in text.split("\n")[:-1]]
 
 
 def until(process: subprocess.Popen[str], true: Callable[[], bool]) -> None:
-    """Wait for something that must come; the deadline only ends a broken test."""
+    """Wait for an outcome; the deadline only ends a broken test."""
     end = time.monotonic() + DEADLINE_S
     while not true():
         if process.poll() is not None or time.monotonic() > end:
@@ -121,7 +117,7 @@ def test_the_result_is_within_three_sigma_of_the_truth_and_a_twentieth_of_a_mill
     check_true(undisturbed[0])
 
 
-def test_the_operator_is_led_through_every_step_and_told_what_has_come_out(
+def test_the_operator_sees_every_step_and_the_result(
     undisturbed: tuple[Path, str],
 ) -> None:
     folder, said = undisturbed
@@ -129,15 +125,15 @@ def test_the_operator_is_led_through_every_step_and_told_what_has_come_out(
         for words in ("HANDS OFF, ALIGNING", "DONE"):
             assert any(step in line and words in line for line in said.splitlines())
     assert f"report: {folder / 'report.html'}" in said
-    assert "half a turn leaves" in said
+    assert "residual velocity after half a turn" in said
 
 
-def test_a_rehearsal_in_fast_time_is_not_said_to_be_at_a_wrong_rate(undisturbed: tuple[Path, str]) -> None:
+def test_a_rehearsal_in_fast_time_is_not_reported_as_a_wrong_rate(undisturbed: tuple[Path, str]) -> None:
     folder, said = undisturbed
     assert "samples/s" not in said + (folder / JOURNAL).read_text()
 
 
-def test_the_operator_is_told_that_the_unit_sends_no_frame_of_the_profile(tmp_path: Path) -> None:
+def test_the_operator_sees_that_the_unit_sends_no_frame_of_the_profile(tmp_path: Path) -> None:
     write_calibration(tmp_path / "unit.yaml", NOMINAL)
     settings_file.write(tmp_path / "site.yaml", BENCH)
     (tmp_path / "short.yaml").write_text(PROCEDURE)
@@ -179,7 +175,7 @@ def test_the_active_certificate_is_the_result_and_the_old_one_is_kept(undisturbe
     assert kept.read_bytes() == (folder / "before.yaml").read_bytes()
 
 
-def test_a_last_rotation_shows_what_compensation_does_and_the_report_tells_it(
+def test_a_last_rotation_shows_the_effect_of_compensation_also_in_the_report(
     undisturbed: tuple[Path, str],
 ) -> None:
     folder, said = undisturbed
@@ -187,7 +183,7 @@ def test_a_last_rotation_shows_what_compensation_does_and_the_report_tells_it(
     # Arms of 20 to 50 mm leave 50 to 150 mm/s; what is left then is tilt and bias over the turn, 2 mm/s.
     assert left["without"] > 0.03
     assert left["compensated"] < 0.1 * left["without"]
-    words = said[said.index("half a turn leaves") :].splitlines()[0]
+    words = said[said.index("residual velocity after half a turn") :].splitlines()[0]
     assert words in (folder / "report.html").read_text()
 
 
@@ -208,7 +204,7 @@ def test_velocity_and_h_of_every_sample_of_every_run_are_logged_once(undisturbed
         newest = int(counter[-1])
 
 
-def test_the_session_computes_again_and_a_flipped_bit_in_its_evidence_is_named(
+def test_the_result_is_recomputed_and_a_flipped_bit_in_the_evidence_is_named(
     undisturbed: tuple[Path, str],
 ) -> None:
     folder, _ = undisturbed
@@ -225,7 +221,7 @@ def test_the_session_computes_again_and_a_flipped_bit_in_its_evidence_is_named(
     assert fault.startswith(f"{recording}: was damaged or changed")
 
 
-def test_a_certificate_that_the_recordings_do_not_give_is_named_though_every_hash_fits(
+def test_a_forged_certificate_is_named_even_if_every_hash_fits(
     undisturbed: tuple[Path, str], tmp_path: Path
 ) -> None:
     folder, _ = undisturbed
@@ -240,28 +236,29 @@ def test_a_certificate_that_the_recordings_do_not_give_is_named_though_every_has
     (forged / "certificate.yaml").write_text(certificate.replace(r_x, f"{r_x}1", 1))
     rewrite(forged, lambda entry: None)
     (fault,) = verify(forged).faults
-    assert fault.startswith(f"{forged / 'certificate.yaml'}: expected what the recordings give")
+    assert fault.startswith(f"{forged / 'certificate.yaml'}: differs from the result of the recordings")
 
 
 def rewrite(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
     """Forge a journal: change its entries, and give every file the hash that it has now."""
     entries = journal(folder)
     (folder / JOURNAL).unlink()
-    for number, entry in enumerate(entries):
+    for entry in entries:
         for key in ("before", "sha256"):
             entry.pop(key)
         if entry["event"] == "file":
             entry["sha256_of_file"] = sha256(folder / entry["name"])
         change(entry)
-        if number == 0:
-            begin(folder / JOURNAL, entry)
+        typed = from_json(entry)
+        if isinstance(typed, Plan):
+            begin(folder / JOURNAL, typed)
             forger = Journal(folder / JOURNAL)
         else:
-            forger.append(entry)
+            forger.append(typed)
     forger.close()
 
 
-def test_a_step_with_a_hole_in_its_recording_is_done_again_alone_and_the_session_ends_well(
+def test_only_the_step_with_a_gap_in_its_recording_is_done_again(
     tmp_path: Path,
 ) -> None:
     folder = tmp_path / "holed"
@@ -309,14 +306,12 @@ def accepted_in(folder: Path) -> list[str]:
     return [entry["step_id"] for entry in journal(folder) if entry["event"] == "accepted"]
 
 
-def test_only_a_session_that_is_there_can_be_done_again_in_part(tmp_path: Path) -> None:
-    with pytest.raises(
-        InputError, match="--redo: expected a session that is there, with --session, got none"
-    ):
-        run(folder=tmp_path / "new", rehearse=True, redo=["z-up"], console=Console())
+def test_only_steps_of_an_existing_session_can_be_done_again(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="--redo: expected an existing session, with --session, got none"):
+        run(RunOptions(tmp_path / "new", rehearse=True, redo=("z-up",)), Console())
 
 
-def test_a_counter_that_went_round_before_the_recording_makes_no_difference(
+def test_a_counter_that_wrapped_before_the_recording_makes_no_difference(
     undisturbed: tuple[Path, str],
 ) -> None:
     folder, _ = undisturbed
@@ -343,7 +338,7 @@ def test_a_counter_that_went_round_before_the_recording_makes_no_difference(
     assert certificates[0].size_effect == certificates[1].size_effect == size_effect(folder)
 
 
-def test_killed_and_stopped_at_random_moments_it_goes_on_where_it_was_and_finds_the_same(
+def test_a_session_killed_and_stopped_at_random_moments_is_resumed_with_the_same_result(
     undisturbed: tuple[Path, str], tmp_path: Path
 ) -> None:
     whole, _ = undisturbed
@@ -357,12 +352,12 @@ def test_killed_and_stopped_at_random_moments_it_goes_on_where_it_was_and_finds_
         out, _ = process.communicate(timeout=DEADLINE_S)
         if number is signal.SIGINT:
             assert process.returncode == 130
-            assert f"go on with: calib run --session {folder}" in out
+            assert f"resume with: calib run --session {folder}" in out
     ended(start(folder))
     check_resumed(folder)
     check_true(folder)
-    # The motion is carried out anew, not quite the same and under other noise: two results of equal sigma
-    # differ by less than three sigma of their difference.
+    # Motion and noise differ between the two sessions: two results of equal sigma differ by less than three
+    # sigma of their difference.
     found = size_effect(folder)
     assert (np.abs(found.r_m - size_effect(whole).r_m) < 3.0 * 2.0**0.5 * sigma(found)).all()
 
@@ -373,9 +368,8 @@ def sigma(found: SizeEffect) -> np.ndarray:
 
 
 def check_true(folder: Path) -> None:
-    """The result is as near to the truth as it says, and as near as is asked for."""
-    unit = technician_scenario(load(str(folder.parent / "short.yaml")), seed=SEED).unit.calibration
-    assert unit is not None
+    """The result agrees with the truth within its own sigma and within the requirement."""
+    unit = true_calibration(SEED)
     assert unit.size_effect is not None
     found = size_effect(folder)
     error = found.r_m - unit.size_effect.r_m
@@ -384,7 +378,7 @@ def check_true(folder: Path) -> None:
 
 
 def check_resumed(folder: Path) -> None:
-    """No accepted step was asked again, no sample logged twice, all evidence is whole."""
+    """No accepted step was repeated, no sample logged twice, all evidence is complete."""
     done: list[str] = []
     logged: set[str] = set()
     for entry in journal(folder):
@@ -398,28 +392,28 @@ def check_resumed(folder: Path) -> None:
     assert verify(folder).faults == ()
 
 
-def test_a_session_that_is_over_is_not_begun_again(undisturbed: tuple[Path, str]) -> None:
+def test_a_complete_session_is_not_resumed(undisturbed: tuple[Path, str]) -> None:
     folder, _ = undisturbed
     with pytest.raises(InputError, match=r"the session is over, see report.html in it"):
-        run(folder=folder, rehearse=True, console=Console())
+        run(RunOptions(folder, rehearse=True), Console())
 
 
 def test_keys_need_a_terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with open(os.devnull) as nothing:
         monkeypatch.setattr(sys, "stdin", nothing)
         with pytest.raises(InputError, match="expected a terminal for the operator's keys"):
-            run(folder=tmp_path / "new", console=Console())
+            run(RunOptions(tmp_path / "new"), Console())
 
 
-def test_a_rehearsal_has_its_own_unit_and_a_unit_no_rehearsal(tmp_path: Path) -> None:
+def test_a_rehearsal_takes_no_unit_and_a_session_of_a_unit_no_rehearsal(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--rehearse: expected no --port"):
-        run(folder=tmp_path / "new", rehearse=True, port="/dev/ttyUSB0", console=Console())
+        run(RunOptions(tmp_path / "new", rehearse=True, port="/dev/ttyUSB0"), Console())
     (tmp_path / JOURNAL).touch()
-    with pytest.raises(InputError, match="expected a rehearsal to go on with"):
-        run(folder=tmp_path, rehearse=True, console=Console())
+    with pytest.raises(InputError, match="expected a rehearsal to resume"):
+        run(RunOptions(tmp_path, rehearse=True), Console())
 
 
-def test_a_recording_that_changes_while_it_is_read_gives_nothing(
+def test_a_recording_that_changes_while_it_is_read_is_refused(
     undisturbed: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     copy = tmp_path / "copy"
@@ -433,10 +427,10 @@ def test_a_recording_that_changes_while_it_is_read_gives_nothing(
     monkeypatch.setattr(atomic, "sha256", change_and_hash)
     session = Session.open(copy)
     with closing(session), pytest.raises(InputError, match=r"z-up.*mcap: .* changed while it was read"):
-        session.identify()
+        identify_session(session)
 
 
-def test_the_plan_holds_the_site_and_the_procedure_that_were_judged(
+def test_the_plan_contains_the_site_and_procedure_that_were_checked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     procedure, site, unit = (tmp_path / f"{name}.yaml" for name in ("procedure", "site", "unit"))
@@ -458,20 +452,20 @@ def test_the_plan_holds_the_site_and_the_procedure_that_were_judged(
 
     monkeypatch.setattr("calib.bench.run.predicted", judge)
     monkeypatch.setattr(Session, "create", create)
+    options = RunOptions(
+        tmp_path / "new",
+        port="/dev/ttyUSB0",
+        profile="imu50-rs422",
+        calibration=unit,
+        site=site,
+        procedure=str(procedure),
+        hands_free=True,
+    )
     with pytest.raises(CreatedError) as created:
-        run(
-            port="/dev/ttyUSB0",
-            profile="imu50-rs422",
-            calibration=unit,
-            site=site,
-            procedure=str(procedure),
-            folder=tmp_path / "new",
-            hands_free=True,
-            console=Console(),
-        )
+        run(options, Console())
     assert created.value.args == texts
 
 
-def test_a_new_session_wants_the_units_papers(tmp_path: Path) -> None:
+def test_a_new_session_needs_port_profile_calibration_and_site(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="expected --port, --profile, --calibration and --site"):
-        run(folder=tmp_path / "new", hands_free=True, console=Console())
+        run(RunOptions(tmp_path / "new", hands_free=True), Console())

@@ -1,16 +1,31 @@
-"""The session's folder: nothing in it can be lost, doubled or changed unseen."""
+"""Folder of a session: nothing in it can be lost, doubled or changed undetected."""
 
 import json
 from collections.abc import Callable, Iterator
 from hashlib import sha256
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
-from calib.bench.session import JOURNAL, EmbeddedFile, Session
+from calib.bench import journal as journals
+from calib.bench.entries import (
+    AcceptedStep,
+    Decision,
+    EmbeddedFile,
+    ServiceMessage,
+    UnitDetected,
+    from_json,
+    to_json,
+)
+from calib.bench.resume import check_files, require_same, require_temperature, resume
+from calib.bench.session import Session
+from calib.bench.state import JOURNAL
 from calib.bench.verify import verify
+from calib.procedure.events import Entered, Finished, Phase, Redone
 from imudrv.calibration import write_calibration
 from imudrv.errors import InputError
 from imudrv.files import atomic, settings_file
@@ -24,53 +39,65 @@ version: 1
 name: two
 poses: [{id: z-up, up: +Z, east: +X, turn_deg: 180}, {id: x-up, up: +X, east: +Y, turn_deg: 180}]
 """
+ACCEPTED = {
+    "first_counter": 1000,
+    "last_counter": 1899,
+    "angle_deg": 180.0,
+    "duration_s": 3.0,
+    "peak_deg_per_s": 110.0,
+    "axis_tilt_deg": 0.1,
+    "rest_before_s": 30.0,
+    "rest_after_s": 4.0,
+    "level_sigma_deg": 0.001,
+    "heading_sigma_deg": 0.05,
+    "heading_deg": 1.0,
+    "v_n": [0.0, 0.0, 0.0],
+}
+"""Fields of an accepted step as the first version journaled them, without its number of samples."""
+FINISHED = Finished(("z-up", "x-up"), (), (), 1900)
 Accept = Callable[..., None]
 
 
-def document(path: Path) -> EmbeddedFile:
-    return EmbeddedFile(str(path), path.read_text())
+def embedded(path: Path) -> EmbeddedFile:
+    return EmbeddedFile.of(path, path.read_bytes())
 
 
 def begin(folder: Path) -> Session:
-    """A session whose unit's papers are beside it."""
+    """A session whose unit's files are beside it."""
     papers = folder.parent
     write_calibration(papers / "unit.yaml", NOMINAL)
     settings_file.write(papers / "site.yaml", Site(latitude_deg=28.2, longitude_deg=113.0, height_m=60.0))
     (papers / "bench.yaml").write_text(PROCEDURE)
     return Session.create(
         folder,
-        procedure=document(papers / "bench.yaml"),
+        procedure=embedded(papers / "bench.yaml"),
         calibration=papers / "unit.yaml",
-        site=document(papers / "site.yaml"),
+        site=embedded(papers / "site.yaml"),
         profile="imu50-rs422",
         port="/dev/ttyUSB0",
     )
 
 
+def accepted_step(step_id: str, recording: str, degc: dict[str, float], **more: object) -> AcceptedStep:
+    fields = {"step_id": step_id, "attempt": 1, "recording": recording, "temperature_degc": degc}
+    step = from_json({"event": "accepted", **ACCEPTED, **fields, **more})
+    assert isinstance(step, AcceptedStep)
+    return step
+
+
 @pytest.fixture
 def accept(recorded: Callable[..., Path]) -> Accept:
-    """Files an attempt with its files; the recording begins at `since`, the evidence at 1000."""
+    """Accept an attempt with its files; the recording begins at `since`, the evidence at 1000."""
 
     def accept(
         session: Session, step_id: str, degc: dict[str, float] = DEGC, since: int = 900, **more: object
     ) -> None:
-        name = f"run-{step_id}-{session.attempt(step_id)}"
+        name = f"run-{step_id}-{session.next_attempt(step_id)}"
         recorded(session.folder / f"{name}.mcap", range(since, 2000))
         (session.folder / f"{name}.npz").write_bytes(name.encode() * 100)
         for suffix in ("mcap", "npz"):
-            session.enter(f"{name}.{suffix}")
-        session.append(
-            {
-                "event": "accepted",
-                "step_id": step_id,
-                "counter": 1000,
-                "first_counter": 1000,
-                "last_counter": 1899,
-                "recording": f"{name}.mcap",
-                "temperature_degc": degc,
-                **more,
-            }
-        )
+            session.record_file(f"{name}.{suffix}")
+        session.append(accepted_step(step_id, f"{name}.mcap", degc, **more))
 
     return accept
 
@@ -84,22 +111,26 @@ def session(tmp_path: Path) -> Iterator[Session]:
 
 @pytest.fixture
 def folder(tmp_path: Path, accept: Accept) -> Path:
-    """A small session that is closed."""
+    """A small closed session."""
     session = begin(tmp_path / "session")
     accept(session, "z-up")
-    session.append({"event": "entered", "step_id": "x-up"})
+    session.append(Entered(Phase.PLACE, "x-up", 1, 1900))
     session.close()
     return session.folder
+
+
+def events(session: Session) -> list[str]:
+    return [to_json(entry)["event"] for entry in session.entries]
 
 
 def line_of(data: bytes, at: int) -> int:
     return data.count(b"\n", 0, at) + 1
 
 
-# The chain
+# Hash chain
 
 
-def test_each_line_is_json_and_bears_the_hash_of_its_text_and_of_the_line_before(folder: Path) -> None:
+def test_each_line_is_json_with_the_hash_of_its_text_and_of_the_line_before(folder: Path) -> None:
     before = ""
     for line in (folder / JOURNAL).read_text().splitlines():
         entry = json.loads(line)
@@ -118,7 +149,7 @@ def test_the_first_line_holds_the_plan(folder: Path) -> None:
     assert "latitude_deg: 28.2" in plan["site"]["text"]
 
 
-def test_a_whole_session_is_found_whole(folder: Path) -> None:
+def test_an_intact_session_has_no_faults(folder: Path) -> None:
     assert verify(folder).faults == ()
 
 
@@ -141,7 +172,7 @@ def test_a_flipped_bit_in_a_file_is_found_and_the_file_named(folder: Path, name:
     session = Session.open(folder)
     for result in ("certificate.yaml", "report.html"):
         (folder / result).write_text("what came out\n")
-        session.enter(result)
+        session.record_file(result)
     session.close()
     data = bytearray((folder / name).read_bytes())
     for at in (0, len(data) // 2, len(data) - 1):
@@ -155,7 +186,7 @@ def test_a_flipped_bit_in_a_file_is_found_and_the_file_named(folder: Path, name:
     assert f"{folder / name}: expected a file, there is none" in fault
 
 
-def test_a_line_that_was_taken_out_or_put_in_or_moved_is_named(folder: Path) -> None:
+def test_a_removed_inserted_or_moved_line_is_named(folder: Path) -> None:
     journal = folder / JOURNAL
     lines = journal.read_bytes().splitlines(keepends=True)
     for changed, number in (
@@ -168,50 +199,129 @@ def test_a_line_that_was_taken_out_or_put_in_or_moved_is_named(folder: Path) -> 
         assert f"line {number}: does not follow the line before it" in fault
 
 
-def test_a_file_that_the_journal_does_not_know_is_told(folder: Path) -> None:
+def test_a_file_that_is_not_in_the_journal_is_reported(folder: Path) -> None:
     (folder / "notes.txt").write_text("by hand\n")
     verified = verify(folder)
     assert verified.faults == ()
     assert any("notes.txt: not in the journal" in note for note in verified.notes)
 
 
+# Entries
+
+
+def test_every_entry_of_an_older_journal_is_read_and_written_back_the_same(tmp_path: Path) -> None:
+    named = {"name": "f", "text": "x: 1\n", "sha256": sha256(b"x: 1\n").hexdigest()}
+    degc = {"gyro": 35.0, "accelerometer_x": None}
+    at = {"step_id": "z-up", "attempt": 1, "counter": 7}
+    recorded = {"recording": "run-z-up-1.mcap", "temperature_degc": degc}
+    lines: list[dict[str, Any]] = [
+        {
+            "event": "plan",
+            "format": "imu50-session",
+            "version": 1,
+            "software": "imu50 0.1.0",
+            "unit": "50-0017",
+            "port": "/dev/ttyUSB0",
+            "certificate": {"path": "/unit.yaml", "sha256": "0" * 64},
+            **dict.fromkeys(("procedure", "site", "profile"), named),
+        },
+        {"event": "file", "name": "before.yaml", "bytes": 9, "sha256_of_file": "1" * 64},
+        {"event": "heard", "counter": 5, "restarted": False, "temperature_degc": degc},
+        {"event": "service", "text": "port lost"},
+        {"event": "entered", "phase": "place", **at},
+        {
+            "event": "checked",
+            "counter": 7,
+            "gravity_m_s2": 9.8,
+            "earth_rate_deg_per_h": 15.0,
+            "noise_deg_per_s": 0.01,
+            "noise_mg": 0.2,
+            "temperature_degc": [["gyro", 35.0], ["accelerometer_x", None]],
+        },
+        {"event": "restarted", "reason": "moved", **at},
+        {"event": "accepted", "step_id": "z-up", "attempt": 1, **ACCEPTED, **recorded},
+        {"event": "rejected", "reasons": ["turned 150 deg"], **at},
+        *({"event": event, **at} for event in ("skipped", "redone", "aborted")),
+        {"event": "finished", "accepted": ["z-up"], "skipped": [], "reasons": [], "counter": 7},
+        {"event": "decision", "accepted": True},
+        {"event": "resumed", "left": ["run-z-up-1.mcap"]},
+        {"event": "dropped", "bytes": 3, "sha256_of_dropped": "2" * 64},
+        {"event": "end", "velocity_left_m_s": {"without": 0.1, "compensated": 0.002}},
+        {"event": "end", "velocity_left_m_s": None},
+    ]
+    before, written = "", ""
+    for line in lines:
+        text = json.dumps({"event": line["event"], "at": "2025-01-01T00:00:00.000+00:00", **line})
+        text = f'{text[:-1]}, "before": "{before}"'
+        before = sha256(text.encode()).hexdigest()
+        written += f'{text}, "sha256": "{before}"}}\n'
+    (tmp_path / JOURNAL).write_text(written)
+    entries = journals.read(tmp_path / JOURNAL).entries
+    for old, entry in zip(lines, entries, strict=True):
+        line: dict[str, Any] = dict(old)
+        again = to_json(entry)
+        # Reasons were texts, and a restart had one.
+        if "reason" in line:
+            line = {"reasons": [line["reason"]], **{k: v for k, v in line.items() if k != "reason"}}
+        if "reasons" in line:
+            again["reasons"] = [english(Message(**reason)) for reason in again["reasons"]]
+        # `samples` and `left` of each file are newer.
+        new = {key for key in ("samples", "left") if key in again and key not in line}
+        assert {k: v for k, v in again.items() if k not in new} == line
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ({"event": "invented"}, "unknown event 'invented'; a newer version may have written it"),
+        ({"event": "file", "name": "a", "bytes": 1}, "event 'file': field sha256_of_file: Field required"),
+        ({"event": "entered", "phase": "sleep", "step_id": "a", "attempt": 1, "counter": 1}, "field phase:"),
+    ],
+)
+def test_an_entry_that_is_not_valid_is_refused_with_its_field(line: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        from_json(line)
+
+
 # Power cuts
 
 
-def test_a_journal_cut_anywhere_in_its_last_line_goes_on_and_nothing_before_it_changes(folder: Path) -> None:
+def test_a_journal_cut_in_its_last_line_is_repaired_and_nothing_before_it_changes(
+    folder: Path,
+) -> None:
     journal = folder / JOURNAL
     data = journal.read_bytes()
     last = data.rindex(b"\n", 0, -1) + 1
     for end in range(last + 1, len(data), 9):
         journal.write_bytes(data[:end])
         (fault,) = verify(folder).faults
-        assert f"line {line_of(data, last)}, the last, is broken" in fault
+        assert f"line {line_of(data, last)}, the last, ends after" in fault
         session = Session.open(folder)
-        assert "as a power cut leaves it; it is dropped" in session.dropped
-        assert [e["event"] for e in session.entries][-2:] == ["accepted", "dropped"]
-        session.append({"event": "after"})
+        assert "as after a power cut; it is dropped" in session.dropped
+        assert events(session)[-2:] == ["accepted", "dropped"]
+        session.append(ServiceMessage("after"))
         session.close()
         assert journal.read_bytes().startswith(data[:end])
         assert verify(folder).faults == ()
         again = Session.open(folder)
         assert again.dropped == ""
-        assert [e["event"] for e in again.entries][-2:] == ["dropped", "after"]
+        assert events(again)[-2:] == ["dropped", "service"]
         again.close()
 
 
-def test_a_second_power_cut_while_the_first_is_mended_does_no_harm(folder: Path) -> None:
+def test_a_second_power_cut_while_the_first_is_repaired_does_no_harm(folder: Path) -> None:
     journal = folder / JOURNAL
     torn = journal.read_bytes()[:-30]
     journal.write_bytes(torn)
     Session.open(folder).close()
-    mended = journal.read_bytes()
-    for end in range(len(torn) + 1, len(mended) + 1, 5):
-        journal.write_bytes(mended[:end])
+    repaired = journal.read_bytes()
+    for end in range(len(torn) + 1, len(repaired) + 1, 5):
+        journal.write_bytes(repaired[:end])
         Session.open(folder).close()
-        assert journal.read_bytes() == mended
+        assert journal.read_bytes() == repaired
 
 
-def test_what_was_dropped_cannot_be_changed_later(folder: Path) -> None:
+def test_a_dropped_line_cannot_be_changed_later(folder: Path) -> None:
     journal = folder / JOURNAL
     torn = journal.read_bytes()[:-30]
     journal.write_bytes(torn)
@@ -232,15 +342,15 @@ def test_a_broken_line_elsewhere_is_an_error_that_names_it(folder: Path) -> None
         Session.open(folder)
 
 
-def test_a_last_line_that_is_whole_but_wrong_is_damage_and_no_power_cut(folder: Path) -> None:
+def test_a_complete_but_wrong_last_line_is_damage_and_no_power_cut(folder: Path) -> None:
     journal = folder / JOURNAL
     data = journal.read_bytes()
     journal.write_bytes(data[:-200] + data[-200:].replace(b"x-up", b"y-up"))
-    with pytest.raises(InputError, match="is damaged: its text does not give its sha256"):
+    with pytest.raises(InputError, match="is damaged: its text does not match its sha256"):
         Session.open(folder)
 
 
-def test_a_journal_without_its_first_line_is_no_session(folder: Path) -> None:
+def test_a_journal_without_a_complete_first_line_is_refused(folder: Path) -> None:
     (folder / JOURNAL).write_bytes(b'{"event": "pl')
     with pytest.raises(InputError, match="expected the plan in line 1"):
         Session.open(folder)
@@ -253,10 +363,10 @@ def test_a_step_is_accepted_until_it_is_done_again(session: Session, accept: Acc
     accept(session, "z-up")
     accept(session, "x-up")
     assert list(session.accepted) == ["z-up", "x-up"]
-    session.append({"event": "redone", "step_id": "z-up"})
+    session.append(Redone("z-up", 2, -1))
     assert list(session.accepted) == ["x-up"]
     accept(session, "z-up")
-    assert session.accepted["z-up"]["recording"] == "run-z-up-2.mcap"
+    assert session.accepted["z-up"].recording == "run-z-up-2.mcap"
 
 
 def test_a_recording_that_does_not_cover_its_step_is_named_whether_there_is_a_certificate_or_not(
@@ -269,7 +379,7 @@ def test_a_recording_that_does_not_cover_its_step_is_named_whether_there_is_a_ce
     for result in (False, True):
         if result:
             write_calibration(session.folder / "certificate.yaml", NOMINAL)
-            session.enter("certificate.yaml")
+            session.record_file("certificate.yaml")
         x_up, verification = verify(session.folder).faults
         again = f"do this step again: calib run --session {session.folder} --redo"
         for fault, step, gap in (
@@ -282,30 +392,28 @@ def test_a_recording_that_does_not_cover_its_step_is_named_whether_there_is_a_ce
             )
 
 
-def test_a_step_that_is_withdrawn_takes_what_was_concluded_from_it_along(
-    session: Session, accept: Accept
-) -> None:
+def test_withdrawing_a_step_withdraws_the_result(session: Session, accept: Accept) -> None:
     accept(session, "z-up")
     accept(session, "x-up", since=1234)
-    session.append({"event": "finished", "accepted": ["z-up", "x-up"]})
+    session.append(FINISHED)
     (session.folder / "certificate.yaml").write_text("what came out\n")
-    session.enter("certificate.yaml")
-    assert session.entry("finished") is not None
+    session.record_file("certificate.yaml")
+    assert session.stage(Finished) is not None
     session.redo(["x-up"])
     assert list(session.accepted) == ["z-up"]
-    assert session.entry("finished") is None
+    assert session.stage(Finished) is None
     assert "certificate.yaml" not in session.files
-    assert session.attempt("x-up") == 2
+    assert session.next_attempt("x-up") == 2
     assert verify(session.folder).faults == ()
     accept(session, "x-up", samples=900)
-    session.append({"event": "finished", "accepted": ["z-up", "x-up"]})
+    session.append(FINISHED)
     (session.folder / "certificate.yaml").write_text("what came out then\n")
-    session.enter("certificate.yaml")
-    assert session.entry("finished") is not None
-    session.require_whole()
+    session.record_file("certificate.yaml")
+    assert session.stage(Finished) is not None
+    check_files(session)
 
 
-def test_a_step_that_there_is_not_cannot_be_done_again_and_the_steps_are_listed(
+def test_an_unknown_step_cannot_be_done_again_and_the_steps_are_listed(
     session: Session, accept: Accept
 ) -> None:
     accept(session, "z-up")
@@ -320,33 +428,33 @@ def test_once_the_result_is_accepted_only_the_verification_is_done_again(
     session: Session, accept: Accept
 ) -> None:
     accept(session, "z-up")
-    session.append({"event": "finished", "accepted": ["z-up"]})
-    session.append({"event": "decision", "accepted": True})
+    session.append(FINISHED)
+    session.append(Decision(True))
     accept(session, "verification")
     with pytest.raises(InputError, match=r"expected one of verification, got 'z-up'; the result is accepted"):
         session.redo(["z-up"])
     session.redo(["verification"])
     assert list(session.accepted) == ["z-up"]
-    assert session.entry("decision") is not None
+    assert session.stage(Decision) is not None
 
 
-def test_an_attempt_that_a_kill_has_ended_counts_and_what_it_left_is_entered(session: Session) -> None:
+def test_an_interrupted_attempt_counts_and_its_files_are_recorded(session: Session) -> None:
     (session.folder / "run-z-up-1.mcap").write_bytes(b"cut")
     (session.folder / "run-z-up-back-7.mcap").write_bytes(b"of another step")
-    assert session.attempt("z-up") == 2
-    assert session.enter_leftovers() == ["run-z-up-1.mcap", "run-z-up-back-7.mcap"]
-    assert session.enter_leftovers() == []
+    assert session.next_attempt("z-up") == 2
+    assert session.record_leftovers() == ("run-z-up-1.mcap", "run-z-up-back-7.mcap")
+    assert session.record_leftovers() == ()
     assert verify(session.folder).faults == ()
 
 
-def test_two_cannot_work_on_one_session(session: Session) -> None:
-    with pytest.raises(InputError, match="another process has it open"):
+def test_only_one_process_can_open_a_session(session: Session) -> None:
+    with pytest.raises(InputError, match="another process has this session open"):
         Session.open(session.folder)
 
 
-def test_a_new_session_does_not_touch_one_that_is_there(folder: Path) -> None:
+def test_a_new_session_does_not_touch_an_existing_one(folder: Path) -> None:
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
-    with pytest.raises(InputError, match="expected a new folder, there is a session in it"):
+    with pytest.raises(InputError, match="expected a new folder, it contains a session"):
         begin(folder)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
     Session.open(folder).close()
@@ -359,14 +467,15 @@ def test_the_service_gets_the_certificate_without_size_effect(session: Session) 
 # Resuming
 
 
-def test_the_same_papers_are_welcome(session: Session) -> None:
+def test_a_session_resumes_with_the_files_it_began_with(session: Session) -> None:
     papers = session.folder.parent
-    session.require_whole()
-    session.require_same()
-    session.require_same(
-        procedure=document(papers / "bench.yaml"),
+    check_files(session)
+    require_same(session)
+    require_same(
+        session,
+        procedure=embedded(papers / "bench.yaml"),
         calibration=papers / "unit.yaml",
-        site=document(papers / "site.yaml"),
+        site=embedded(papers / "site.yaml"),
         profile="imu50-rs422",
     )
 
@@ -375,26 +484,26 @@ def test_another_unit_is_refused(session: Session) -> None:
     other = NOMINAL.model_copy(update={"serial_number": "50-0018"})
     write_calibration(session.folder.parent / "unit.yaml", other)
     with pytest.raises(InputError, match=r"cannot be resumed:\n  unit: expected 'nominal', got '50-0018'"):
-        session.require_same()
+        require_same(session)
 
 
 @pytest.mark.parametrize(
     ("given", "message"),
     [
         (
-            {"procedure": EmbeddedFile("other.yaml", "another\n")},
-            "procedure: expected .*bench.yaml as it was, got other",
+            {"procedure": EmbeddedFile.of("other.yaml", b"another\n")},
+            "procedure: expected .*bench.yaml unchanged, got other",
         ),
         (
-            {"site": EmbeddedFile("roof.yaml", "another\n")},
-            "site: expected .*site.yaml as it was, got roof.yaml",
+            {"site": EmbeddedFile.of("roof.yaml", b"another\n")},
+            "site: expected .*site.yaml unchanged, got roof.yaml",
         ),
-        ({"profile": "imu50-can"}, "profile: expected imu50-rs422 as it was, got imu50-can"),
+        ({"profile": "imu50-can"}, "profile: expected imu50-rs422 unchanged, got imu50-can"),
     ],
 )
-def test_other_papers_are_refused(session: Session, given: dict[str, Any], message: str) -> None:
+def test_other_files_are_refused(session: Session, given: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        session.require_same(**given)
+        require_same(session, **given)
 
 
 def test_a_certificate_that_was_changed_meanwhile_is_refused_but_the_sessions_own_result_is_not(
@@ -402,33 +511,52 @@ def test_a_certificate_that_was_changed_meanwhile_is_refused_but_the_sessions_ow
 ) -> None:
     active = session.folder.parent / "unit.yaml"
     write_calibration(active, session.calibration())
-    with pytest.raises(InputError, match="certificate: expected the one that it began with"):
-        session.require_same()
+    with pytest.raises(InputError, match="certificate: expected the one that the session began with"):
+        require_same(session)
     (session.folder / "certificate.yaml").write_bytes(active.read_bytes())
-    session.enter("certificate.yaml")
-    session.require_same()
+    session.record_file("certificate.yaml")
+    require_same(session)
 
 
 def test_a_temperature_far_from_the_accepted_runs_is_refused(session: Session, accept: Accept) -> None:
-    session.require_temperature({"gyro": 20.0})
+    require_temperature(session, {"gyro": 20.0})
     accept(session, "z-up", {"gyro": 34.0, "accelerometer_x": 36.0})
     accept(session, "x-up", {"gyro": 36.0, "accelerometer_x": 36.0})
-    session.require_temperature({"gyro": 39.9, "accelerometer_x": None})
+    require_temperature(session, {"gyro": 39.9, "accelerometer_x": None})
     with pytest.raises(InputError, match=r"gyro: expected 35\.0 degC within 5 K, .* got 40\.1"):
-        session.require_temperature({"gyro": 40.1, "accelerometer_x": 36.0})
+        require_temperature(session, {"gyro": 40.1, "accelerometer_x": 36.0})
     with pytest.raises(InputError, match="got 29"):
-        session.require_temperature({"gyro": 29.0})
+        require_temperature(session, {"gyro": 29.0})
 
 
 def test_a_session_with_a_damaged_recording_is_not_resumed(session: Session, accept: Accept) -> None:
     accept(session, "z-up")
     (session.folder / "run-z-up-1.mcap").write_bytes(b"other")
     with pytest.raises(InputError, match=r"cannot be resumed:\n  .*run-z-up-1.mcap: was damaged"):
-        session.require_whole()
+        check_files(session)
 
 
-def test_a_number_that_json_does_not_know_is_refused_before_it_is_written(session: Session) -> None:
+@pytest.mark.parametrize("answer", ["y", "n"])
+def test_the_operator_is_asked_before_a_session_is_resumed(
+    session: Session, accept: Accept, monkeypatch: pytest.MonkeyPatch, answer: str
+) -> None:
+    accept(session, "z-up")
+    shown, before = StringIO(), len(session.entries)
+    monkeypatch.setattr("builtins.input", lambda *_: answer)
+    console = Console(file=shown, width=200)
+    if answer == "n":
+        with pytest.raises(InputError, match="not resumed and not changed"):
+            resume(session, console, ["z-up"], asks=True)
+        assert len(session.entries) == before
+    else:
+        resume(session, console, ["z-up"], asks=True)
+        assert events(session)[before:] == ["redone", "resumed"]
+    assert "of unit nominal: accepted steps: z-up" in shown.getvalue()
+    assert "resume it? [y/n]" in shown.getvalue()
+
+
+def test_a_number_that_is_not_json_is_refused_before_it_is_written(session: Session) -> None:
     before = (session.folder / JOURNAL).read_bytes()
     with pytest.raises(ValueError, match="not JSON compliant"):
-        session.append({"event": "odd", "value": float(np.nan)})
+        session.append(UnitDetected(1, False, {"gyro": float(np.nan)}))
     assert (session.folder / JOURNAL).read_bytes() == before

@@ -1,4 +1,4 @@
-"""A rehearsal at a terminal that takes no output for a while, as after Ctrl-S or when ssh is stuck."""
+"""Rehearsal at a terminal that accepts no output for a while, as after Ctrl-S or when ssh hangs."""
 
 import json
 import os
@@ -10,7 +10,7 @@ from pathlib import Path
 from threading import Event, Thread
 from typing import Any
 
-from calib.bench.session import JOURNAL
+from calib.bench.state import JOURNAL
 from calib.bench.verify import verify
 
 PROCEDURE = """
@@ -32,7 +32,7 @@ CTRL_S, CTRL_Q = b"\x13", b"\x11"
 
 
 class Terminal:
-    """A terminal that takes output only while somebody reads it, and while it is not stopped by Ctrl-S."""
+    """A terminal that accepts output only while it is read and not stopped by Ctrl-S."""
 
     def __init__(self) -> None:
         self._master, self.slave = pty.openpty()
@@ -57,7 +57,7 @@ def journal(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text().split("\n")[:-1]] if path.exists() else []
 
 
-def test_a_terminal_that_takes_no_output_for_a_whole_step_costs_no_evidence(tmp_path: Path) -> None:
+def test_a_terminal_that_accepts_no_output_for_a_whole_step_costs_no_evidence(tmp_path: Path) -> None:
     procedure, folder, terminal = tmp_path / "short.yaml", tmp_path / "session", Terminal()
     procedure.write_text(PROCEDURE)
     command = ["run", "--rehearse", "--speed", str(SPEED), "--procedure", str(procedure)]

@@ -1,11 +1,12 @@
-"""Whether a recording covers the samples that a step was accepted on."""
+"""Coverage of the evidence by the recordings."""
 
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from calib.bench.evidence import Attempt, require_covered, uncovered
+from calib.bench.evidence import require_covered, uncovered
+from calib.bench.state import Attempt
 from calib.procedure.schema import Step
 from imudrv import profiles
 from imudrv.errors import InputError
@@ -52,7 +53,7 @@ def test_what_the_recording_does_not_cover_is_named(
         require_covered(attempt(path, samples))
 
 
-def test_samples_that_the_line_lost_are_not_missed_in_the_recording(
+def test_samples_lost_on_the_line_are_not_missing_from_the_recording(
     recorded: Recorded, tmp_path: Path
 ) -> None:
     lost = range(3000, 3007)
@@ -66,7 +67,7 @@ def test_samples_that_the_line_lost_are_not_missed_in_the_recording(
 
 
 @pytest.mark.parametrize("rounds", [0, 3, 70_000])
-def test_a_narrow_counter_goes_round_before_and_within_the_recording(
+def test_a_narrow_counter_wraps_before_and_within_the_recording(
     recorded: Recorded, tmp_path: Path, rounds: int
 ) -> None:
     text = profiles.content("imu50-rs422").decode().replace("counter, type: u32", "counter, type: u16")
@@ -81,7 +82,7 @@ def test_a_narrow_counter_goes_round_before_and_within_the_recording(
     )
 
 
-def test_what_came_before_a_restart_of_the_unit_is_no_evidence(recorded: Recorded, tmp_path: Path) -> None:
+def test_samples_before_a_restart_of_the_unit_are_no_evidence(recorded: Recorded, tmp_path: Path) -> None:
     path = recorded(tmp_path / "run.mcap", [*range(1000, 3000), *range(1900, 5500)])
     assert uncovered(attempt(path)) == ""
     late = recorded(tmp_path / "late.mcap", [*range(1000, 5500), *range(2100, 5500)])

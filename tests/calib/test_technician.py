@@ -29,7 +29,7 @@ LAYOUT = load_profile("imu50-rs422").layout()
 
 @dataclass
 class Performance:
-    """What a rehearsal gave."""
+    """Result of a rehearsal."""
 
     scenario: Scenario
     procedure: Procedure
@@ -197,7 +197,7 @@ CLUMSY = {
 
 
 @pytest.mark.parametrize("name", list(CLUMSY))
-def test_each_mistake_is_caught_named_and_made_good(name: str) -> None:
+def test_each_mistake_is_detected_named_and_corrected(name: str) -> None:
     mistakes, reasons, said = CLUMSY[name]
 
     done = perform(short(), mistakes)
@@ -214,12 +214,12 @@ def test_each_mistake_is_caught_named_and_made_good(name: str) -> None:
     assert_identified(done)
 
 
-def test_a_mistake_in_a_step_that_there_is_not_is_refused() -> None:
+def test_a_mistake_in_an_unknown_step_is_refused() -> None:
     with pytest.raises(InputError, match=r"different steps of z-up, x-up, y-up, got z-down"):
         technician_scenario(short(), [Mistake("z-down", "slow")])
 
 
-def test_a_procedure_that_begins_upside_down_is_rehearsed_too() -> None:
+def test_a_procedure_that_begins_upside_down_can_be_rehearsed() -> None:
     plan = short()
     pose = plan.poses[0].model_copy(update={"id": "z-down", "up": "-Z", "east": "-X"})
     plan = plan.model_copy(update={"poses": (pose,)})

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from calib.bench import block_letters
 from calib.bench.keys import Keyboard
-from calib.bench.screen import UNHEARD, UNREADABLE, OperatorScreen, plain, screen, with_port_state
+from calib.bench.screen import NO_DATA, NO_FRAMES, OperatorScreen, plain, screen, with_port_state
 from calib.procedure.events import Abort, Confirm, Phase, Redo, Skip, View
 from calib.procedure.messages import english, verbatim
 from imudrv.diagnosis import LineState
@@ -36,8 +36,8 @@ HEADLINES = (
     "CHECK FAILED: SEE WHY",
     "GOOD: STEP 12 OF 20 DONE",
     "WAIT FOR THE UNIT",
-    english(UNHEARD),
-    english(UNREADABLE),
+    english(NO_DATA),
+    english(NO_FRAMES),
 )
 
 
@@ -132,7 +132,7 @@ def test_bars_figures_and_reasons_are_on_the_screen() -> None:
         "ROTATE 1:15",
         "+90.0 of +180 deg",
         "44 deg/s",
-        "moves",
+        "moving",
         "level 0.0031 deg, heading 0.0821 deg",
         "turned 148.3 deg, want 180 +- 5",
         "Enter: confirm   r: redo   s: skip   q: abort",

@@ -1,4 +1,4 @@
-"""The worker between engine, session and operator, with samples from a queue instead of a unit."""
+"""Controller of a session, with samples from a queue instead of a unit."""
 
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -13,18 +13,27 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from calib.bench import controller as conducts
+from calib.bench import completion
+from calib.bench import controller as controllers
 from calib.bench.controller import SessionController
+from calib.bench.entries import (
+    AcceptedStep,
+    EmbeddedFile,
+    Entry,
+    FileRecorded,
+    ServiceMessage,
+    UnitDetected,
+    to_json,
+)
 from calib.bench.evidence import Result
-from calib.bench.journal import Entry
 from calib.bench.keys import Keyboard
 from calib.bench.queue_sink import QueueSink
 from calib.bench.screen import OperatorScreen, plain
-from calib.bench.session import EmbeddedFile, Session
+from calib.bench.session import Session
 from calib.bench.technician import BENCH, Mistake, technician_scenario
 from calib.bench.verify import verify
-from calib.procedure.events import View
-from calib.procedure.messages import Message, english
+from calib.procedure.events import Accepted, Entered, Phase, Rejected, View
+from calib.procedure.messages import english
 from calib.procedure.plan import steps_left
 from calib.procedure.schema import Procedure
 from imudrv import profiles
@@ -61,7 +70,7 @@ PROCEDURE = settings_file.parse_text(ONE.encode(), Procedure, "one.yaml")
 
 
 class Line:
-    """In the place of the service, whose unit has sent everything already: records it from its history."""
+    """Stand-in for the service, whose unit has already sent everything: records from the history."""
 
     def __init__(self, history: History) -> None:
         self.stopped = False
@@ -72,7 +81,7 @@ class Line:
 
     @property
     def port_state(self) -> LineState:
-        """The next state at each look; at last nothing is wrong."""
+        """Next state at each call; without a fault at the end."""
         return self.states.pop(0) if self.states else LineState("streaming")
 
     def publish(self, batch: Batch) -> None:
@@ -103,7 +112,7 @@ class Line:
 
 
 class Typed(Keyboard):
-    """Keys that are pressed once the screen asks for something."""
+    """Keyboard that answers what the screen shows."""
 
     def __init__(self, press: Callable[[str], str] = lambda _: "") -> None:
         super().__init__()
@@ -115,22 +124,22 @@ class Typed(Keyboard):
 
 
 class Shown(OperatorScreen):
-    """A screen that the fingers see at once."""
+    """Screen that the keyboard reads at once."""
 
     def __init__(self, keys: Typed) -> None:
         self.text = StringIO()
         super().__init__(Console(file=self.text, width=200))
-        self._fingers = keys
+        self._typed = keys
 
     def show(self, view: View, question: str = "") -> None:
         super().show(view, question)
         while not self.is_idle:
             sleep(0.001)
-        self._fingers.seen = plain(view, question)
+        self._typed.seen = plain(view, question)
 
 
 def performed(scenario: Scenario) -> list[Batch]:
-    """A technician's samples, in pieces of a fifth of a second."""
+    """Samples of a scenario, in pieces of a fifth of a second."""
     compensator = Compensator(
         coefficients(NOMINAL.model_copy(update={"size_effect": None})),
         LAYOUT,
@@ -156,9 +165,9 @@ def session(tmp_path: Path) -> Iterator[Session]:
     settings_file.write(tmp_path / "site.yaml", BENCH)
     session = Session.create(
         tmp_path / "session",
-        procedure=EmbeddedFile("one.yaml", ONE),
+        procedure=EmbeddedFile.of("one.yaml", ONE.encode()),
         calibration=tmp_path / "unit.yaml",
-        site=EmbeddedFile("site.yaml", (tmp_path / "site.yaml").read_text()),
+        site=EmbeddedFile.of("site.yaml", (tmp_path / "site.yaml").read_bytes()),
         profile="imu50-rs422",
         port="nowhere",
     )
@@ -177,9 +186,9 @@ def conducted(
     dropped: range = range(0),
     port_states: Sequence[LineState] = (),
 ) -> tuple[SessionController, str]:
-    """Work through items, behind which nothing comes; `stopped`: the service ended before they were taken.
+    """Run the controller over items; `stopped`: the service ended before they were taken.
 
-    All of them have passed before the worker begins: it is as late as it can be. `dropped`: samples that the
+    All items have passed before the controller begins: it is as late as possible. `dropped`: samples that the
     first recording lacks.
     """
     tap, line, keys = QueueSink(None), Line(History(history_bytes)), keys or Typed()
@@ -187,7 +196,7 @@ def conducted(
     line.states += port_states
     for item in items:
         if isinstance(item, str):
-            tap.tell(item)
+            tap.put_message(item)
         else:
             tap.publish(item)
             line.publish(item)
@@ -196,7 +205,6 @@ def conducted(
     screen = Shown(keys)
     conduct = SessionController(
         session,
-        PROCEDURE,
         LAYOUT,
         line,  # type: ignore[arg-type]
         tap,
@@ -210,22 +218,27 @@ def conducted(
     return conduct, screen.text.getvalue()
 
 
-def reasons(entry: Entry) -> list[str]:
-    """English reasons of a line of the journal."""
-    return [english(Message(**reason)) for reason in entry["reasons"]]
-
-
 def events(session: Session) -> list[str]:
-    return [entry["event"] for entry in session.entries]
+    return [to_json(entry)["event"] for entry in session.entries]
+
+
+def rejected(session: Session) -> Rejected:
+    """The only rejection."""
+    (entry,) = (entry for entry in session.entries if isinstance(entry, Rejected))
+    return entry
+
+
+def phases(session: Session, phase: Phase) -> list[Entered]:
+    return [entry for entry in session.entries if isinstance(entry, Entered) and entry.phase is phase]
 
 
 def test_a_step_is_accepted_once_its_files_are_in(session: Session, batches: list[Batch]) -> None:
     conducted(session, list(batches))
     (accepted,) = session.accepted.values()
-    assert accepted["recording"] == "run-z-up-1.mcap"
-    assert accepted["temperature_degc"]["gyro"] == 35.0
+    assert accepted.recording == "run-z-up-1.mcap"
+    assert accepted.temperature_degc["gyro"] == 35.0
     at = events(session).index("accepted")
-    assert [entry.get("name") for entry in session.entries[at - 2 : at]] == [
+    assert [entry.name for entry in session.entries[at - 2 : at] if isinstance(entry, FileRecorded)] == [
         "run-z-up-1.mcap",
         "run-z-up-1.npz",
     ]
@@ -235,7 +248,7 @@ def test_a_step_is_accepted_once_its_files_are_in(session: Session, batches: lis
     assert verify(session.folder).faults == ()
 
 
-def test_with_an_operator_nothing_goes_on_without_a_key(session: Session, batches: list[Batch]) -> None:
+def test_with_an_operator_nothing_continues_without_a_key(session: Session, batches: list[Batch]) -> None:
     _, text = conducted(session, list(batches), hands_free=False)
     assert "READY: CONFIRM" in text
     assert "align" not in text
@@ -245,47 +258,48 @@ def test_with_an_operator_nothing_goes_on_without_a_key(session: Session, batche
 def test_the_operators_key_confirms(
     session: Session, batches: list[Batch], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(conducts, "SHOWN_S", 0.0)
+    monkeypatch.setattr(controllers, "REDRAW_S", 0.0)
     keys = Typed(lambda seen: "\n" if "CONFIRM" in seen else "")
     conducted(session, list(batches), keys, hands_free=False)
     assert list(session.accepted) == ["z-up"]
 
 
-def test_an_abort_leaves_a_session_to_go_on_with(
+def test_an_aborted_session_can_be_resumed(
     session: Session, batches: list[Batch], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(conducts, "SHOWN_S", 0.0)
+    monkeypatch.setattr(controllers, "REDRAW_S", 0.0)
     keys = Typed(lambda seen: "q" if "align" in seen else "")
     conduct, text = conducted(session, list(batches), keys)
-    assert "q once more: abort" in text
+    assert "q again: abort" in text
     assert conduct.error is None
     assert conduct.outcome == ""
     assert sorted(events(session)[-2:]) == ["aborted", "file"]
-    assert session.attempt("z-up") == 2
+    assert session.next_attempt("z-up") == 2
     assert not session.is_over
 
 
-def test_what_the_service_says_of_the_port_is_shown_and_journaled(
+def test_messages_of_the_service_about_the_port_are_shown_and_journaled(
     session: Session, batches: list[Batch], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(conducts, "SHOWN_S", 0.0)
+    monkeypatch.setattr(controllers, "REDRAW_S", 0.0)
     lost = "port lost: the other end has gone"
     states = [LineState("streaming")] * 20 + [LineState("lost", "the other end has gone")] * 20
     _, text = conducted(session, [*batches[:50], lost, *batches[50:60]], port_states=states)
     assert f"! {lost}" in text
-    assert [entry["text"] for entry in session.entries if entry["event"] == "service"] == [lost]
+    assert [entry.text for entry in session.entries if isinstance(entry, ServiceMessage)] == [lost]
     assert "!" not in text.splitlines()[-1]
 
 
 def test_a_mistake_is_journaled_with_its_reasons_and_its_evidence_kept(session: Session) -> None:
     scenario = technician_scenario(PROCEDURE, [Mistake("z-up", "short")], calibration=NOMINAL)
     _, text = conducted(session, performed(scenario))
-    (rejected,) = (entry for entry in session.entries if entry["event"] == "rejected")
-    assert "turned 150" in reasons(rejected)[0]
+    rejection = rejected(session)
+    assert "turned 150" in english(rejection.reasons[0])
     assert "turned 150" in text
-    assert session.accepted["z-up"]["recording"] == "run-z-up-2.mcap"
-    before = session.entries[session.entries.index(rejected) - 1]
-    assert before["name"] == "run-z-up-1.mcap"  # it ends with the verdict
+    assert session.accepted["z-up"].recording == "run-z-up-2.mcap"
+    before = session.entries[session.entries.index(rejection) - 1]
+    assert isinstance(before, FileRecorded)
+    assert before.name == "run-z-up-1.mcap"  # it ends with the verdict
     assert "run-z-up-2.mcap" in session.files
 
 
@@ -296,57 +310,54 @@ def test_a_recording_begins_where_the_engine_asked_for_the_unit_to_be_placed(
     session: Session, batches: list[Batch]
 ) -> None:
     conducted(session, list(batches))
-    placed = next(e for e in session.entries if e["event"] == "entered" and e["phase"] == "place")
+    placed = phases(session, Phase.PLACE)[0]
     recording = Recording(session.folder / "run-z-up-1.mcap")
     decoder, tracker = FrameDecoder(LAYOUT), SequenceTracker(LAYOUT)
     pulses = tracker.feed(decoder.feed(b"".join(bytes(a.data) for a in recording.arrivals())))
     published = np.concatenate(list(recording.increments()))["counter"]
     # two batches of 200 samples in front of that one
-    assert placed["counter"] - 600 < pulses["counter"][0] <= placed["counter"]
+    assert placed.counter - 600 < pulses["counter"][0] <= placed.counter
     assert (np.diff(pulses["counter"]) == 1).all()
     assert np.array_equal(published, pulses["counter"])
 
 
 @pytest.mark.parametrize("history_bytes", [1 << 20, 4 << 20])
-def test_where_the_history_does_not_reach_back_the_step_is_asked_again_with_the_reason(
+def test_a_step_is_repeated_with_the_reason_if_the_history_is_too_short(
     session: Session, batches: list[Batch], history_bytes: int
 ) -> None:
     _, text = conducted(session, list(batches), history_bytes=history_bytes)
     assert session.accepted == {}
-    (rejected,) = (entry for entry in session.entries if entry["event"] == "rejected")
-    (reason,) = reasons(rejected)
+    (reason,) = map(english, rejected(session).reasons)
     assert re.match(r"its recording does not cover counters \d+\.\.\d+: this computer", reason)
     assert reason in text
     assert "GOOD" not in text
-    asked = [e["attempt"] for e in session.entries if e.get("phase") == "place"]
-    assert asked == [1, 2]
+    assert [entry.attempt for entry in phases(session, Phase.PLACE)] == [1, 2]
     assert "run-z-up-1.mcap" in session.files
     assert verify(session.folder).faults == ()
 
 
-def test_a_step_whose_recording_has_a_hole_is_done_again_and_then_counts(session: Session) -> None:
+def test_a_step_with_a_gap_in_its_recording_is_repeated_and_then_accepted(session: Session) -> None:
     pose = ONE[ONE.index("{id") : ONE.index("]")]
     twice = ONE.replace(pose, f"{pose}, {pose.replace('z-up', 'again')}")
     procedure = settings_file.parse_text(twice.encode(), Procedure, "twice.yaml")
     batches = performed(technician_scenario(procedure, calibration=NOMINAL))
     aligning = int(batches[250].pulses["counter"][0])
     conducted(session, list(batches), dropped=range(aligning, aligning + 200))
-    (rejected,) = (entry for entry in session.entries if entry["event"] == "rejected")
-    assert f"does not cover counters {aligning}..{aligning + 199}" in reasons(rejected)[0]
-    assert session.accepted["z-up"]["recording"] == "run-z-up-2.mcap"
+    assert f"does not cover counters {aligning}..{aligning + 199}" in english(rejected(session).reasons[0])
+    assert session.accepted["z-up"].recording == "run-z-up-2.mcap"
     assert verify(session.folder).faults == ()
 
 
 def test_a_key_refers_to_the_view_that_the_operator_sees(
     session: Session, batches: list[Batch], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(conducts, "SHOWN_S", 0.0)
+    monkeypatch.setattr(controllers, "REDRAW_S", 0.0)
     monkeypatch.setattr(Shown, "show", lambda *_: None)  # the terminal is stopped
     conducted(session, list(batches), Typed(lambda _: "\n"), hands_free=False)
-    assert not [entry for entry in session.entries if entry.get("phase") == "settle"]
+    assert phases(session, Phase.SETTLE) == []
 
 
-def test_evidence_is_whole_though_the_worker_is_held_up_for_as_long_as_a_step_takes(
+def test_evidence_is_complete_even_if_the_worker_is_late_by_a_whole_step(
     session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     done = technician_scenario(PROCEDURE, calibration=NOMINAL)
@@ -355,22 +366,23 @@ def test_evidence_is_whole_though_the_worker_is_held_up_for_as_long_as_a_step_ta
         tmp_path / "technician.yaml", done.model_copy(update={"motion": (*done.motion, stays)})
     )
     settings = Settings(
-        port=f"sim://{tmp_path / 'technician_scenario.yaml'}?speed=20",
+        port=f"sim://{tmp_path / 'technician.yaml'}?speed=20",
         profile="imu50-rs422",
         calibration=str(session.folder / "working.yaml"),
         status=str(tmp_path / "socket"),
     )
     append, tap, keys = session.append, QueueSink(None), Typed()
 
-    def held_up(entry: dict[str, Any]) -> None:
+    def delayed_append(entry: Entry) -> None:
         append(entry)
-        while entry.get("phase") == "preflight" and tap.state.queued < 70_000:  # its alignment is over
+        is_preflight = isinstance(entry, Entered) and entry.phase is Phase.PREFLIGHT
+        while is_preflight and tap.state.queued < 70_000:  # its alignment is over
             sleep(0.01)
 
-    monkeypatch.setattr(session, "append", held_up)
+    monkeypatch.setattr(session, "append", delayed_append)
     service = Service(settings, lambda _: None, [tap], history=History())
     conduct = SessionController(
-        session, PROCEDURE, LAYOUT, service, tap, Shown(keys), keys, hands_free=True, begin=lambda _: None
+        session, LAYOUT, service, tap, Shown(keys), keys, hands_free=True, begin=lambda _: None
     )
     worker = Thread(target=conduct.run)
     worker.start()
@@ -385,20 +397,16 @@ def test_evidence_is_whole_though_the_worker_is_held_up_for_as_long_as_a_step_ta
 # Resumed
 
 
-def accepted_at(session: Session, degc: float, counter: int) -> None:
-    session.append(
-        {
-            "event": "accepted",
-            "step_id": "another",
-            "counter": counter,
-            "recording": "run-another-1.mcap",
-            "temperature_degc": {"gyro": degc},
-        }
+def accepted_at(session: Session, degc: float) -> None:
+    verdict = Accepted(
+        "another", 1, 0, 1, 180.0, 3.0, 110.0, 0.1, 30.0, 4.0, 0.001, 0.05, 1.0, (0.0, 0.0, 0.0)
     )
+    step = AcceptedStep(**vars(verdict), recording="run-another-1.mcap", temperature_degc={"gyro": degc})
+    session.append(step)
 
 
 def test_at_another_temperature_a_session_is_not_resumed(session: Session, batches: list[Batch]) -> None:
-    accepted_at(session, 20.0, 0)
+    accepted_at(session, 20.0)
     conduct, _ = conducted(session, list(batches[:10]))
     assert isinstance(conduct.error, InputError)
     assert "cannot be resumed now: gyro: expected 20.0 degC within 5 K" in str(conduct.error)
@@ -408,10 +416,11 @@ def test_at_another_temperature_a_session_is_not_resumed(session: Session, batch
 def test_a_restart_of_the_unit_between_steps_is_noted(
     session: Session, batches: list[Batch], newest: int, restarted: bool
 ) -> None:
-    accepted_at(session, 35.0, newest)
+    accepted_at(session, 35.0)
+    session.append(Entered(Phase.PLACE, "another", 1, newest))
     conducted(session, list(batches[:10]))
-    (heard,) = (entry for entry in session.entries if entry["event"] == "heard")
-    assert heard["restarted"] is restarted
+    (detected,) = (entry for entry in session.entries if isinstance(entry, UnitDetected))
+    assert detected.restarted is restarted
 
 
 # The decision
@@ -419,38 +428,39 @@ def test_a_restart_of_the_unit_between_steps_is_noted(
 
 @pytest.fixture
 def found(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A result without recordings to it."""
+    """A result without recordings."""
 
     nothing: Any = None
-    monkeypatch.setattr(Session, "identify", lambda _: Result(nothing, NOMINAL))
+    monkeypatch.setattr(completion, "identify_session", lambda _: Result(nothing, NOMINAL))
+    monkeypatch.setattr(controllers, "summary", lambda _: "a result")
 
 
-def test_a_result_that_is_turned_down_changes_nothing(
+def test_a_result_that_is_rejected_changes_nothing(
     session: Session, batches: list[Batch], found: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    before = session.plan.certificate.read_bytes()
-    monkeypatch.setattr(SessionController, "_decided", lambda *_: False)
+    before = session.plan.certificate.path.read_bytes()
+    monkeypatch.setattr(controllers, "decide_alone", lambda _: False)
     conduct, _ = conducted(session, list(batches), stopped=False)
-    assert "turned down" in conduct.outcome
+    assert "rejected; certificate unchanged" in conduct.outcome
     assert session.is_over
-    assert session.plan.certificate.read_bytes() == before
+    assert session.plan.certificate.path.read_bytes() == before
 
 
-def test_nothing_is_decided_behind_a_ctrl_c(session: Session, batches: list[Batch], found: None) -> None:
-    before = session.plan.certificate.read_bytes()
+def test_nothing_is_decided_after_ctrl_c(session: Session, batches: list[Batch], found: None) -> None:
+    before = session.plan.certificate.path.read_bytes()
     conduct, _ = conducted(session, list(batches), stopped=True)
     assert conduct.error is None
     assert conduct.outcome == ""
     assert "certificate.yaml" in session.files
     assert "decision" not in events(session)
-    assert session.plan.certificate.read_bytes() == before
+    assert session.plan.certificate.path.read_bytes() == before
 
 
-def test_a_certificate_that_somebody_changed_meanwhile_is_not_overwritten(
+def test_an_active_certificate_that_was_changed_meanwhile_is_not_overwritten(
     session: Session, batches: list[Batch], found: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(SessionController, "_decided", lambda *_: True)
-    active = session.plan.certificate
+    monkeypatch.setattr(controllers, "decide_alone", lambda _: True)
+    active = session.plan.certificate.path
     active.write_text(active.read_text() + "# by hand\n")
     conduct, _ = conducted(session, list(batches), stopped=False)
     assert isinstance(conduct.error, InputError)
@@ -458,7 +468,7 @@ def test_a_certificate_that_somebody_changed_meanwhile_is_not_overwritten(
     assert active.read_text().endswith("# by hand\n")
 
 
-def test_steps_left_are_those_not_done_with_all_that_they_had() -> None:
+def test_the_remaining_steps_keep_all_their_settings() -> None:
     text = ONE.replace(
         "poses: [", "poses: [{id: a, up: +X, east: +Y, turn_deg: -180, align_s: 40, repeats: 2}, "
     )

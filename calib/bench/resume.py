@@ -1,0 +1,137 @@
+"""Conditions for resuming a session, and the operator's consent."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from rich.console import Console
+
+from calib.bench.entries import EmbeddedFile, Resumed
+from calib.bench.session import Session
+from calib.bench.state import RESULT
+from calib.bench.verify import faulty_files
+from imudrv import profiles
+from imudrv.calibration import read_calibration
+from imudrv.errors import InputError
+from imudrv.files import atomic
+
+RESUME_KELVIN: Final = 5.0
+"""Largest difference of a temperature from its mean over the accepted runs when a session is resumed, K."""
+
+
+def check_files(session: Session) -> None:
+    """Raise `InputError` if a file of the session is missing or damaged."""
+    if faults := faulty_files(session):
+        raise InputError("\n  ".join([f"{session.folder}: cannot be resumed:", *faults]))
+
+
+def require_same(
+    session: Session,
+    *,
+    procedure: EmbeddedFile | None = None,
+    calibration: Path | None = None,
+    site: EmbeddedFile | None = None,
+    profile: str | None = None,
+) -> None:
+    """Refuse to resume a session with other files than it began with.
+
+    Parameters
+    ----------
+    session : Session
+        The session.
+    procedure, calibration, site, profile
+        Files given now; None stands for the session's own.
+
+    Raises
+    ------
+    InputError
+        At least one differs; the message lists all that differ.
+    """
+    plan, differ = session.plan, []
+    active = calibration or plan.certificate.path
+    now = read_calibration(active)
+    if now.serial_number != plan.unit:
+        differ.append(f"unit: expected {plan.unit!r}, got {now.serial_number!r} ({active})")
+    elif (digest := atomic.sha256(active)) not in (plan.certificate.sha256, session.files.get(RESULT)):
+        differ.append(
+            f"certificate: expected the one that the session began with ({plan.certificate.sha256[:12]}), "
+            f"got another of the same unit ({active}, {digest[:12]})"
+        )
+    given = [
+        ("procedure", procedure, plan.procedure),
+        ("site", site, plan.site),
+        ("profile", profile and EmbeddedFile.of(profile, profiles.content(profile)), plan.profile),
+    ]
+    differ += [
+        f"{name}: expected {began.name} unchanged, got {file.name} with other contents"
+        for name, file, began in given
+        if file and file.sha256 != began.sha256
+    ]
+    if differ:
+        raise InputError(
+            "\n  ".join(
+                [
+                    f"{session.folder}: cannot be resumed:",
+                    *differ,
+                    "use the files that the session began with, or begin another session",
+                ]
+            )
+        )
+
+
+def require_temperature(session: Session, degc: Mapping[str, float | None]) -> None:
+    """Refuse to resume a session at another temperature than that of the accepted runs.
+
+    Parameters
+    ----------
+    session : Session
+        The session.
+    degc : mapping
+        Temperature now by channel, degrees Celsius; None if unknown.
+
+    Raises
+    ------
+    InputError
+        One differs by more than `RESUME_KELVIN`.
+    """
+    for name, now in degc.items():
+        known = [t for a in session.accepted.values() if (t := a.temperature_degc.get(name)) is not None]
+        if now is None or not known:
+            continue
+        mean = float(np.mean(known))
+        if abs(now - mean) > RESUME_KELVIN:
+            raise InputError(
+                f"{session.folder}: cannot be resumed now: {name}: expected {mean:.1f} degC within "
+                f"{RESUME_KELVIN:g} K, as in the accepted runs, got {now:.1f}; wait until the unit has that "
+                "temperature, or begin another session"
+            )
+
+
+def resume(session: Session, console: Console, redo: Sequence[str], *, asks: bool) -> None:
+    """Report the progress of a session, ask whether to resume it, and withdraw the steps to be done again.
+
+    Parameters
+    ----------
+    session : Session
+        The session.
+    console : Console
+        Terminal of the operator.
+    redo : sequence of str
+        Steps to be done again.
+    asks : bool
+        The operator is asked; otherwise the session is resumed at once.
+
+    Raises
+    ------
+    InputError
+        The operator declines, or a step does not exist.
+    """
+    lines = [session.dropped] if session.dropped else []
+    accepted = ", ".join(session.accepted) or "none yet"
+    lines.append(f"session {session.folder} of unit {session.plan.unit}: accepted steps: {accepted}")
+    console.print("\n".join(lines), markup=False, soft_wrap=True)
+    if asks and console.input("resume it? \\[y/n] ").strip().lower() not in ("y", "yes"):
+        raise InputError(f"{session.folder}: not resumed and not changed; name another folder to begin anew")
+    session.redo(redo)
+    session.append(Resumed(session.record_leftovers()))

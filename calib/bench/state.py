@@ -1,0 +1,177 @@
+"""State of a session, as its journal determines it."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final, NamedTuple, TypeVar
+
+from calib.bench.entries import (
+    AcceptedStep,
+    Decision,
+    EmbeddedFile,
+    Entry,
+    FileRecorded,
+    Plan,
+    SessionEnded,
+)
+from calib.identification import PriorCalibration
+from calib.procedure.events import Finished, Redone
+from calib.procedure.plan import verification
+from calib.procedure.schema import VERIFICATION, Procedure, Step
+from imudrv.calibration import read_calibration
+from imudrv.errors import InputError
+from imudrv.files import settings_file
+from imudrv.files.model import M
+from imudrv.site import Site
+
+JOURNAL: Final = "journal.jsonl"
+
+
+INITIAL_CERTIFICATE: Final = "before.yaml"
+
+
+WORKING_CERTIFICATE: Final = "working.yaml"
+
+
+RESULT: Final = "certificate.yaml"
+
+
+REPORT: Final = "report.html"
+
+
+LOCK: Final = ".lock"
+
+
+Stage = TypeVar("Stage", Finished, Decision, SessionEnded)
+
+
+class Attempt(NamedTuple):
+    """An accepted attempt at a step.
+
+    Attributes
+    ----------
+    step : Step
+        The step.
+    recording : Path
+        Its recording.
+    first_counter, last_counter : int
+        First and last sample of the evidence, in the service's count.
+    samples : int or None
+        Number of samples of the evidence; None if unknown, as in sessions of an older version.
+    """
+
+    step: Step
+    recording: Path
+    first_counter: int
+    last_counter: int
+    samples: int | None = None
+
+
+class SessionState:
+    """Plan, accepted steps, files and stage of a session.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the session.
+    entries : sequence of Entry
+        Entries of its journal; when the journal grows, so does the state.
+
+    Attributes
+    ----------
+    plan : Plan
+        First entry of the journal.
+
+    Raises
+    ------
+    InputError
+        The journal does not begin with a plan.
+    """
+
+    def __init__(self, folder: Path, entries: Sequence[Entry]) -> None:
+        plan = entries[0]
+        if not isinstance(plan, Plan):
+            raise InputError(f"{folder / JOURNAL}: line 1: expected the plan of an imu50-session, version 1")
+        self.folder, self.entries, self.plan = folder, entries, plan
+
+    @property
+    def files(self) -> dict[str, str]:
+        """Names of the files in the journal, with their SHA-256."""
+        files: dict[str, str] = {}
+        for entry in self.entries:
+            if isinstance(entry, FileRecorded):
+                files[entry.name] = entry.sha256_of_file
+            elif _withdraws_result(entry):
+                files.pop(RESULT, None)
+        return files
+
+    @property
+    def accepted(self) -> dict[str, AcceptedStep]:
+        """Accepted steps by their id."""
+        accepted: dict[str, AcceptedStep] = {}
+        for entry in self.entries:
+            if isinstance(entry, AcceptedStep):
+                accepted[entry.step_id] = entry
+            elif isinstance(entry, Redone):
+                accepted.pop(entry.step_id, None)
+        return accepted
+
+    def stage(self, kind: type[Stage]) -> Stage | None:
+        """Return the entry of a stage that was reached, None if it was not or no longer counts.
+
+        Parameters
+        ----------
+        kind : type
+            `Finished`, `Decision` or `SessionEnded`. None of them counts once a step of the procedure is
+            withdrawn.
+        """
+        for entry in reversed(self.entries):
+            if _withdraws_result(entry):
+                return None
+            if isinstance(entry, kind):
+                return entry
+        return None
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the session is complete, or its result was rejected."""
+        last = self.entries[-1]
+        return isinstance(last, SessionEnded) or (isinstance(last, Decision) and not last.accepted)
+
+    def site(self) -> Site:
+        """Return the site of the session."""
+        return _parse(self.plan.site, Site)
+
+    def procedure(self) -> Procedure:
+        """Return the procedure of the session."""
+        return _parse(self.plan.procedure, Procedure)
+
+    def initial_calibration(self) -> PriorCalibration:
+        """Return the certificate with which the session began."""
+        certificate = self.plan.certificate
+        return PriorCalibration(
+            read_calibration(self.folder / INITIAL_CERTIFICATE), certificate.path.name, certificate.sha256
+        )
+
+    def attempts(self) -> dict[str, Attempt]:
+        """Return the accepted attempts by step id, in the order of the procedure, the verification last."""
+        procedure, accepted = self.procedure(), self.accepted
+        return {
+            step.id: Attempt(step, self.folder / a.recording, a.first_counter, a.last_counter, a.samples)
+            for step in (*procedure.steps, *verification(procedure).steps)
+            if (a := accepted.get(step.id)) is not None
+        }
+
+
+def require_session(folder: Path) -> None:
+    """Raise `InputError` unless the folder contains a session."""
+    if not (folder / JOURNAL).exists():
+        raise InputError(f"{folder}: expected a session, got no {JOURNAL} in it")
+
+
+def _parse(file: EmbeddedFile, model: type[M]) -> M:
+    return settings_file.parse_text(file.text.encode(), model, file.name)
+
+
+def _withdraws_result(entry: Entry) -> bool:
+    """Whether an entry withdraws the result: a step of the procedure is done again."""
+    return isinstance(entry, Redone) and entry.step_id != VERIFICATION
