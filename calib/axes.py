@@ -11,24 +11,24 @@ Side = Literal["+X", "-X", "+Y", "-Y", "+Z", "-Z"]
 
 
 def vector(axis: Side) -> Array:
-    """Unit vector of a body axis, '+X' to '-Z', body axes."""
+    """Return the unit vector of a signed body axis, in body axes, shape (3,)."""
     v = np.zeros(3)
     v["XYZ".index(axis[1])] = -1.0 if axis[0] == "-" else 1.0
     return v
 
 
 def opposite(axis: Side) -> Side:
-    """Turn the sign of a body axis round."""
+    """Return a body axis with the other sign."""
     other: dict[Side, Side] = {"+X": "-X", "-X": "+X", "+Y": "-Y", "-Y": "+Y", "+Z": "-Z", "-Z": "+Z"}
     return other[axis]
 
 
 def side(axis: str) -> str:
-    """Name of a body axis in a sentence: ``X`` for '+X', ``-X`` for '-X'."""
+    """Return the name of a body axis for a sentence: ``X`` for '+X', ``-X`` for '-X'."""
     return axis.removeprefix("+")
 
 
 def axis_name(v_b: Array) -> str:
-    """Body axis nearest to a vector, with its sign: '+X' to '-Z'."""
+    """Return the signed body axis nearest to a vector, '+X' to '-Z'."""
     k = int(np.argmax(np.abs(v_b)))
     return f"{'+' if v_b[k] > 0 else '-'}{'XYZ'[k]}"

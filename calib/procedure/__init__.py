@@ -10,4 +10,5 @@ attempt      evidence of one attempt at a step
 events       actions, events and views
 preflight    check of the sensors before the first step
 prompts      what the operator has to do
+messages     keys with values, and a catalogue for each language
 """

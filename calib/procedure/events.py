@@ -1,6 +1,6 @@
-"""What goes into the procedure's engine and what comes out: keys, events, the log of a run, the view.
+"""Input and output of the procedure's engine: actions, events, the log of a run, the view.
 
-Fields of keys and events are text, numbers and tuples of them, so that a journal can hold them as JSON.
+Fields of actions and events are text, numbers, messages and tuples of them: a journal holds them as JSON.
 """
 
 from collections.abc import Mapping
@@ -19,7 +19,7 @@ PREFLIGHT: Final = "preflight"
 
 
 class Phase(StrEnum):
-    """Where the procedure is."""
+    """Phase of the procedure; see `calib.procedure.transitions`."""
 
     PREFLIGHT = "preflight"
     PLACE = "place"
@@ -33,7 +33,7 @@ class Phase(StrEnum):
 
 
 class Conditions(NamedTuple):
-    """What the unit tells beside its samples; once a second, or when it changes.
+    """Status of the unit beside its samples; once a second, or when it changes.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ class Conditions(NamedTuple):
     faults : tuple of str
         Those that mean a fault.
     temperature_degc : mapping of str to float or None
-        By channel; None: not known.
+        By channel; None: unknown.
     """
 
     bits: tuple[str, ...] = ()
@@ -52,28 +52,28 @@ class Conditions(NamedTuple):
 
 @dataclass(frozen=True)
 class Confirm:
-    """The unit stands as the step wants it; counts in PLACE of that step, while the sensors agree."""
+    """The unit is in the pose of the step; counts in PLACE of that step, while the sensors agree."""
 
     step_id: str
 
 
 @dataclass(frozen=True)
 class Redo:
-    """Do a step again, the current one from its beginning or one that was accepted; evidence is kept."""
+    """Repeat a step, the current one or one that was accepted or skipped; evidence is kept."""
 
     step_id: str
 
 
 @dataclass(frozen=True)
 class Skip:
-    """Leave the current step out; `Redo` comes back to it."""
+    """Omit the current step; `Redo` comes back to it."""
 
     step_id: str
 
 
 @dataclass(frozen=True)
 class Abort:
-    """End it."""
+    """End the procedure."""
 
 
 Action: TypeAlias = Confirm | Redo | Skip | Abort
@@ -81,7 +81,7 @@ Action: TypeAlias = Confirm | Redo | Skip | Abort
 
 @dataclass(frozen=True)
 class Entered:
-    """A phase has begun; `counter` is that of the newest sample looked at, -1 before the first."""
+    """A phase has begun; `counter` is that of the newest sample processed, -1 before the first."""
 
     phase: Phase
     step_id: str
@@ -96,7 +96,7 @@ class Checked:
     Attributes
     ----------
     gravity_m_s2, earth_rate_deg_per_h : float
-        Sizes of the mean readings.
+        Magnitudes of the mean readings.
     noise_deg_per_s, noise_mg : float
         Rms over 20 ms at rest.
     temperature_degc : tuple of (str, float or None)
@@ -113,7 +113,7 @@ class Checked:
 
 @dataclass(frozen=True)
 class Restarted:
-    """The alignment of an attempt begins again."""
+    """The alignment of an attempt starts again."""
 
     step_id: str
     attempt: int
@@ -123,24 +123,24 @@ class Restarted:
 
 @dataclass(frozen=True)
 class Accepted:
-    """A rotation serves.
+    """A rotation is accepted.
 
     Attributes
     ----------
     first_counter, last_counter : int
-        Samples of the evidence, both included: rest before, rotation, rest after, and nothing else.
+        First and last sample of the evidence: rest before, rotation, rest after, and nothing else.
     angle_deg, duration_s, peak_deg_per_s, axis_tilt_deg : float
-        The rotation, as found in these samples.
+        The rotation, as detected in these samples.
     rest_before_s, rest_after_s : float
-        The rests beside it.
+        Lengths of the rests before and after it.
     level_sigma_deg, heading_sigma_deg : float
-        Predicted for the alignment.
+        1-sigma predicted for the alignment.
     heading_deg : float
-        How far the pose was turned clockwise, -180 to 180.
+        Clockwise deviation from the heading of the pose, -180 to 180.
     v_n : tuple of 3 float
         Mean velocity east, north, up in the half second after the turn, m/s.
     samples : int or None
-        Number of samples of the evidence, less than the counters span where the line lost some; None in the
+        Number of samples of the evidence, fewer than the counters span where some were lost; None in the
         journal of an older version.
     """
 
@@ -163,9 +163,9 @@ class Accepted:
 
 @dataclass(frozen=True)
 class Rejected:
-    """An attempt, or the preflight (`step_id` is `PREFLIGHT`), cannot serve; each reason bears its number.
+    """An attempt, or the preflight (`step_id` is `PREFLIGHT`), is rejected.
 
-    It follows `Accepted` of the same attempt where the evidence turned out not to be kept.
+    It follows `Accepted` of the same attempt where the evidence could not be stored.
     """
 
     step_id: str
@@ -176,7 +176,7 @@ class Rejected:
 
 @dataclass(frozen=True)
 class Skipped:
-    """A step is left out."""
+    """A step is skipped."""
 
     step_id: str
     attempt: int
@@ -185,7 +185,7 @@ class Skipped:
 
 @dataclass(frozen=True)
 class Redone:
-    """A step is done again, from `attempt` on."""
+    """A step is repeated, from `attempt` on."""
 
     step_id: str
     attempt: int
@@ -200,8 +200,8 @@ class Finished:
     ----------
     accepted, skipped : tuple of str
         Step ids.
-    reasons : tuple of str
-        What the accepted ones do not see, if anything.
+    reasons : tuple of Message
+        Why the accepted steps are not sufficient, if they are not.
     """
 
     accepted: tuple[str, ...]
@@ -212,7 +212,7 @@ class Finished:
 
 @dataclass(frozen=True)
 class Aborted:
-    """The operator has ended it."""
+    """The operator has ended the procedure."""
 
     step_id: str
     attempt: int
@@ -229,17 +229,17 @@ class NavigationLog:
     Attributes
     ----------
     step_id, attempt
-        Of the run.
+        Step and attempt of the run.
     first_counter, last_counter : int
         As in `Accepted`.
     counter : ndarray of int64, shape (n,)
-        Of the samples.
+        Sample counter.
     t_s : ndarray, shape (n,)
-        Their ends, from the start of navigation, by the counter.
+        End of each sample since the start of navigation, by the counter.
     v_n : ndarray, shape (n, 3)
         Navigated velocity east, north, up, m/s.
     H : ndarray, shape (n, 3, 9)
-        Its answer to (r_x, r_y, r_z), m/s a metre.
+        Sensitivity of the velocity to (r_x, r_y, r_z), m/s per metre.
     """
 
     step_id: str
@@ -254,38 +254,41 @@ class NavigationLog:
 
 @dataclass(frozen=True)
 class View:
-    """All that a screen shows.
+    """Content of the operator's screen.
 
     Attributes
     ----------
     phase : Phase
-        Where the procedure is.
+        Current phase.
     step, steps : int
-        Number of the step, from 1, and how many there are.
-    step_id, title : str
-        Of the step: ``x-up``, and ``step 2 of 3: X up, +180 deg``.
-    headline : str
-        What to do now, at most 38 characters.
-    hints : tuple of str
-        How, and what is expected.
-    reasons : tuple of str
-        Why something was rejected or has begun again.
+        Number of the step, from 1, and number of steps.
+    step_id : str
+        Id of the step.
+    title : Message
+        Title of the step: ``step 2 of 3: X up, +180 deg``.
+    headline : Message
+        What to do now; at most 38 characters in English.
+    hints : tuple of Message
+        How to do it, and what is expected.
+    reasons : tuple of Message
+        Why something was rejected or has started again.
     angle_deg, want_deg : float or None
-        Turned about the vertical, and what it shall become, in ROTATE and REST.
+        Rotation about the vertical so far, and the required one, in ROTATE and REST.
     rate_deg_per_s : float
-        About the vertical in ROTATE and REST, else the size of the rate.
+        Rate about the vertical in ROTATE and REST, else the magnitude of the rate.
     stillness : float
-        0 moving to 1 still: 1 less a ninth of how many times the limit is passed, over the last half second.
+        From 0, moving, to 1, at rest: 1 less a ninth of the largest excess over the motion limit, in units of
+        that limit, in the last half second.
     progress : float or None
-        Of the phase, 0 to 1.
+        Elapsed part of the phase, 0 to 1.
     remaining_s : float or None
-        Of the phase.
+        Remaining time of the phase.
     level_sigma_deg, heading_sigma_deg : float or None
-        Of the alignment, once it can tell.
+        1-sigma of the alignment, once it is known.
     actions : tuple of str
-        What keys do now: 'confirm', 'redo', 'skip', 'abort'.
+        Keys that have an effect now: 'confirm', 'redo', 'skip', 'abort'.
     bells : int
-        Counts up when a turn is due, a step is done or an attempt is rejected.
+        Increases when a rotation is due, a step is done or an attempt is rejected.
     """
 
     phase: Phase

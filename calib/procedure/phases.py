@@ -1,7 +1,7 @@
 """Phases of the procedure: blocks of 20 ms in, outcome and prompt out."""
 
 from dataclasses import replace
-from typing import ClassVar, Final
+from typing import Final
 
 import numpy as np
 
@@ -43,27 +43,25 @@ _PRIORS: Final = Priors()
 
 
 class PhaseState:
-    """A phase while it lasts; made when the phase begins."""
+    """A phase while it lasts; made when the phase begins.
 
-    turning: ClassVar = False  # shows the angle about the vertical
+    Attributes
+    ----------
+    progress : Progress
+        The shared state.
+    step_id, number
+        Step id and attempt number of the events of this phase.
+    duration_s : float or None
+        Length of the phase, where it is fixed.
+    turning : bool
+        The angle about the vertical is shown.
+    """
 
-    def __init__(self, progress: Progress) -> None:
-        self.progress = progress
+    turning = False
 
-    @property
-    def step_id(self) -> str:
-        """Step id of the events of this phase."""
-        return self.progress.step.id
-
-    @property
-    def number(self) -> int:
-        """Attempt number of the events of this phase."""
-        return self.progress.number
-
-    @property
-    def duration_s(self) -> float | None:
-        """Length of the phase, where it is fixed."""
-        return None
+    def __init__(self, progress: Progress, duration_s: float | None = None) -> None:
+        self.progress, self.duration_s = progress, duration_s
+        self.step_id, self.number = progress.step.id, progress.number
 
     def feed(self, block: Block) -> Outcome | None:
         """Take a block; None: the phase continues."""
@@ -78,25 +76,10 @@ class Preflight(PhaseState):
     """Half a minute at rest shows whether the sensors are sound."""
 
     def __init__(self, progress: Progress) -> None:
-        super().__init__(progress)
+        super().__init__(progress, PREFLIGHT_S)
+        self.step_id, self.number = PREFLIGHT, 1
         self._averages = RestAverages()
-        self._number = 1
         self._failed = False
-
-    @property
-    def step_id(self) -> str:
-        """Step id of the events of this phase."""
-        return PREFLIGHT
-
-    @property
-    def number(self) -> int:
-        """Number of the check."""
-        return self._number
-
-    @property
-    def duration_s(self) -> float:
-        """Length of the rest."""
-        return PREFLIGHT_S
 
     def prompt(self) -> Prompt:
         """Return what the operator has to do."""
@@ -148,8 +131,8 @@ class Preflight(PhaseState):
         p = self.progress
         if not self._failed:
             p.bells += 1
-            p.events.append(Rejected(PREFLIGHT, self._number, p.reasons, p.counter))
-            self._number += 1
+            p.events.append(Rejected(PREFLIGHT, self.number, p.reasons, p.counter))
+            self.number += 1
         self._failed = True
 
 
@@ -175,13 +158,8 @@ class Settling(PhaseState):
     """The unit has to rest for a while before the alignment begins."""
 
     def __init__(self, progress: Progress) -> None:
-        super().__init__(progress)
+        super().__init__(progress, progress.procedure.limits.still_s)
         progress.attempt = Attempt()
-
-    @property
-    def duration_s(self) -> float:
-        """Length of the rest."""
-        return self.progress.procedure.limits.still_s
 
     def feed(self, block: Block) -> Outcome | None:
         """Start again after motion."""
@@ -192,7 +170,7 @@ class Settling(PhaseState):
             p.elapsed_s, p.attempt = 0.0, Attempt()
             return None
         p.attempt.append(block)
-        return Outcome.SETTLED if p.elapsed_s >= self.duration_s else None
+        return Outcome.SETTLED if p.elapsed_s >= p.procedure.limits.still_s else None
 
     def prompt(self) -> Prompt:
         """Return what the operator has to do."""
@@ -203,7 +181,7 @@ class Aligning(PhaseState):
     """The alignment is evaluated at growing intervals; motion and faults start it again."""
 
     def __init__(self, progress: Progress) -> None:
-        super().__init__(progress)
+        super().__init__(progress, progress.step.align_s)
         self._alignment = Alignment(
             progress.site.latitude_rad,
             _PRIORS.gyro_bias,
@@ -214,14 +192,9 @@ class Aligning(PhaseState):
         self._next_s = MIN_ALIGNMENT_S
         progress.attempt.align(self._alignment)
 
-    @property
-    def duration_s(self) -> float:
-        """Length of the alignment."""
-        return self.progress.step.align_s
-
     def prompt(self) -> Prompt:
         """Return what the operator has to do."""
-        return prompts.align()
+        return Prompt(message("aligning"), (message("do_not_touch"),))
 
     def feed(self, block: Block) -> Outcome | None:
         """Align."""
@@ -230,7 +203,7 @@ class Aligning(PhaseState):
             return p.restart(message("alignment_interrupted", elapsed_s=p.elapsed_s, cause=cause))
         attempt.append(block)
         self._averages.feed(block)
-        if p.elapsed_s < min(self._next_s, self.duration_s - 0.5 * p.interval_s):
+        if p.elapsed_s < min(self._next_s, p.step.align_s - 0.5 * p.interval_s):
             return None
         self._next_s = max(p.elapsed_s + 10.0, 1.2 * p.elapsed_s)
         attempt.process()
@@ -304,30 +277,25 @@ class Resting(PhaseState):
     turning = True
 
     def __init__(self, progress: Progress) -> None:
-        super().__init__(progress)
+        super().__init__(progress, progress.step.rest_s)
         progress.elapsed_s = progress.stillness.quiet_s
-
-    @property
-    def duration_s(self) -> float:
-        """Length of the rest."""
-        return self.progress.step.rest_s
 
     def prompt(self) -> Prompt:
         """Return what the operator has to do."""
-        return prompts.rest()
+        return Prompt(message("resting"), (message("do_not_touch"),))
 
     def feed(self, block: Block) -> Outcome | None:
         """Judge the rotation after the rest."""
         p, attempt = self.progress, self.progress.attempt
         attempt.append(block)
         if cause := p.disturbance(block):
-            rest_s = self.duration_s
+            rest_s = p.step.rest_s
             return p.reject(message("rest_interrupted", elapsed_s=p.elapsed_s, rest_s=rest_s, cause=cause))
-        if p.stillness.quiet_s < self.duration_s + _MARGIN_S:
+        if p.stillness.quiet_s < p.step.rest_s + _MARGIN_S:
             return None
         attempt.process()
         rotation = attempt.rotation()
-        reasons = _rejections(p, rotation, self.duration_s)
+        reasons = _rejections(p, rotation, p.step.rest_s)
         accepted = None if reasons or rotation is None else self._accepted(rotation)
         if accepted is None:
             return p.reject(*reasons)
@@ -392,7 +360,9 @@ class Done(PhaseState):
 
     def prompt(self) -> Prompt:
         """Return the number of steps."""
-        return prompts.done(len(self.progress.accepted), len(self.progress.procedure.steps))
+        accepted = len(self.progress.accepted)
+        skipped = len(self.progress.procedure.steps) - accepted
+        return Prompt(message("all_done"), (message("count", accepted=accepted, skipped=skipped),))
 
 
 class Stopped(PhaseState):
@@ -400,7 +370,7 @@ class Stopped(PhaseState):
 
     def prompt(self) -> Prompt:
         """Return that it has ended."""
-        return prompts.aborted()
+        return Prompt(message("aborted"))
 
 
 STATES: Final[dict[Phase, type[PhaseState]]] = {

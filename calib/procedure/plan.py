@@ -17,13 +17,13 @@ from imudrv.site import Site
 from imudrv.units import DEG_PER_SQRT_H
 
 TURN_S: Final = 2.5
-"""A rotation by hand from rest to rest, as predictions take it, s."""
+"""Duration of a rotation by hand from rest to rest, for predictions, s."""
 
 
 TYPICAL_NOISE: Final = Noise(
     angle_walk=0.002 * DEG_PER_SQRT_H, velocity_walk=8e-5, velocity_white=6e-5, velocity_pulse=1.2e-4
 )
-"""Of a unit of the kind that was not measured yet; how its pulses beat makes it quieter in some poses."""
+"""Noise of a unit that was not measured yet; the beat of its pulses makes it quieter in some poses."""
 
 
 def predicted(
@@ -33,20 +33,20 @@ def predicted(
     priors: Priors | None = None,
     skipped: Collection[str] = (),
 ) -> Prediction:
-    """Tell what a procedure will give.
+    """Predict the accuracy of a procedure.
 
     Parameters
     ----------
     procedure : Procedure
         The plan.
     site : Site
-        Where the unit stands.
+        Location of the unit.
     noise : Noise, optional
-        Of the unit's sensors; `TYPICAL_NOISE` where it was not measured yet.
+        Noise of the sensors; `TYPICAL_NOISE` where it was not measured yet.
     priors : Priors, optional
-        What the static calibration leaves.
+        Residual errors of the static calibration.
     skipped : collection of str
-        Ids of steps that are left out.
+        Ids of skipped steps.
 
     Returns
     -------
@@ -56,7 +56,7 @@ def predicted(
     Raises
     ------
     InputError
-        The rotations do not see the six differences; names the directions.
+        The six differences are not observable from these rotations; names the directions.
     """
     plan = [
         PlannedRotation(step.up, step.turn_deg, TURN_S, step.rest_s)
@@ -70,12 +70,12 @@ def predicted(
 
 
 def steps_left(procedure: Procedure, done: Collection[str]) -> Procedure:
-    """The procedure of the steps that are not done.
+    """Return a procedure of the steps that are not done.
 
     Parameters
     ----------
     procedure : Procedure
-        The whole one.
+        The complete one.
     done : collection of str
         Ids of steps; not all of them.
 
@@ -87,7 +87,7 @@ def steps_left(procedure: Procedure, done: Collection[str]) -> Procedure:
 
 
 def verification(procedure: Procedure) -> Procedure:
-    """One more rotation, `VERIFICATION`, from where the last one ended."""
+    """Return a procedure of one more rotation, `VERIFICATION`, from the pose in which the last one ended."""
     last = procedure.steps[-1]
     return _with_steps(procedure, [replace(last, id=VERIFICATION, east=opposite(last.east))])
 
@@ -98,7 +98,7 @@ def _with_steps(procedure: Procedure, steps: Sequence[Step]) -> Procedure:
 
 
 def shipped() -> list[str]:
-    """Names of the procedures that come with the package."""
+    """Return the names of the procedures that come with the package."""
     return sorted(p.name.removesuffix(".yaml") for p in (resources.files("calib") / "procedures").iterdir())
 
 
@@ -113,7 +113,7 @@ def load(name_or_path: str) -> Procedure:
     Returns
     -------
     Procedure
-        Checked.
+        The checked procedure.
 
     Raises
     ------

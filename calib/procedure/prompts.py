@@ -163,11 +163,6 @@ def settle(observed: StepObservation) -> Prompt:
     return Prompt(message("settling"), _motion(observed))
 
 
-def align() -> Prompt:
-    """Prompt for the alignment."""
-    return Prompt(message("aligning"), (message("do_not_touch"),))
-
-
 def rotate(observed: StepObservation, rotation: RotationTracker) -> Prompt:
     """Prompt for the rotation."""
     step, limits = observed.step, observed.limits
@@ -192,11 +187,6 @@ def rotate(observed: StepObservation, rotation: RotationTracker) -> Prompt:
     return Prompt(message("rotate", turn_deg=step.turn_deg), (instruction,))
 
 
-def rest() -> Prompt:
-    """Prompt for the rest after the rotation."""
-    return Prompt(message("resting"), (message("do_not_touch"),))
-
-
 def verdict(step: Step, number: int, steps: int, accepted: Accepted | None) -> Prompt:
     """Verdict on an attempt; None: it was rejected."""
     if accepted is None:
@@ -208,16 +198,6 @@ def verdict(step: Step, number: int, steps: int, accepted: Accepted | None) -> P
         peak_deg_per_s=accepted.peak_deg_per_s,
     )
     return Prompt(message("step_done", step=number, steps=steps), (hint,))
-
-
-def done(accepted: int, steps: int) -> Prompt:
-    """Prompt for the end."""
-    return Prompt(message("all_done"), (message("count", accepted=accepted, skipped=steps - accepted),))
-
-
-def aborted() -> Prompt:
-    """Prompt for the end after an abort."""
-    return Prompt(message("aborted"))
 
 
 def _turn_to_heading(observed: StepObservation, clockwise: float) -> Prompt:

@@ -1,8 +1,9 @@
-"""The bench procedure as data: which side up, which way round, how long, and what has to be kept.
+"""Schema of a procedure file: poses, rotations, rests and limits.
 
 A file lists poses; `Procedure.steps` are its rotations in order, a pose with `repeats` gives several. The id
-of a step never changes, so that a journal, a key and a recording can name it. `predicted` tells what the plan
-will give before anyone lifts anything, and refuses one that does not see the six differences.
+of a step never changes, so that a journal, a key and a recording can name it.
+`calib.procedure.plan.predicted` gives the accuracy of a plan in advance, and refuses one from which the six
+differences are not observable.
 """
 
 from collections import Counter
@@ -13,23 +14,23 @@ import numpy as np
 from pydantic import Field as Key
 from pydantic import model_validator
 
-from calib.axes import Side, opposite, side, vector
+from calib.axes import Side, opposite, vector
 from calib.detection import acceptance
 from imudrv.arrays import Array
 from imudrv.files.model import Model
 from imudrv.nav.alignment import MAX_ALIGNMENT_S, MIN_ALIGNMENT_S
 
 VERIFICATION: Final = "verification"
-"""Step id of the rotation after the result."""
+"""Step id of the rotation that verifies the result."""
 
 
 class ProcedureLimits(Model):
-    """What poses, rests and rotations have to keep.
+    """Limits of poses, rests and rotations.
 
-    `tilt_deg`: how far the upper axis may lean. `heading_deg`: how far the pose may be turned about the
-    vertical; 180: any way round. `still_s`: so long it stands still before the alignment. `noise_deg_per_s`
-    and `noise_mg`: largest noise of the sensors at rest, rms over 20 ms; what counts as motion follows from
-    the noise that was found. The others are those of `calib.detection.acceptance.RotationLimits`.
+    `tilt_deg`: largest angle between the upper axis and the vertical. `heading_deg`: largest deviation of the
+    pose about the vertical; 180: any heading. `still_s`: rest before the alignment. `noise_deg_per_s` and
+    `noise_mg`: largest noise of the sensors at rest, rms over 20 ms; the limits of motion follow from the
+    measured noise. The others are those of `calib.detection.acceptance.RotationLimits`.
     """
 
     tilt_deg: Annotated[float, Key(gt=0, le=20)] = 5.0
@@ -43,10 +44,10 @@ class ProcedureLimits(Model):
 
 
 class Pose(Model):
-    """A pose and the rotation in it: `up` points up and `east` about east, before the turn.
+    """A pose and the rotation in it: `up` points up and `east` about east, before the rotation.
 
-    `turn_deg` is right-handed about the vertical: +180 is counter-clockwise, seen from above. After a turn
-    the pose is the other way round, so that a repeat begins where the turn before it ended. `align_s` and
+    `turn_deg` is right-handed about the vertical: +180 is counter-clockwise, seen from above. Each
+    rotation reverses the heading, so that a repeat begins where the rotation before it ended. `align_s` and
     `rest_s` are those of the procedure where they are absent.
     """
 
@@ -74,13 +75,13 @@ class Step:
     Attributes
     ----------
     id : str
-        Of the pose; with repeats ``ID-1``, ``ID-2``, ...
+        Id of the pose; with repeats ``ID-1``, ``ID-2``, ...
     up, east : str
-        Body axes that point up and about east before the turn.
+        Body axes that point up and about east before the rotation.
     turn_deg : int
         +180 or -180, right-handed about up.
     align_s, rest_s : float
-        Rest that is aligned on, and rest after the turn.
+        Length of the alignment, and of the rest after the rotation.
     """
 
     id: str
@@ -91,13 +92,8 @@ class Step:
     rest_s: float
 
     @property
-    def title(self) -> str:
-        """Such as ``X up, +180 deg``."""
-        return f"{side(self.up)} up, {self.turn_deg:+d} deg"
-
-    @property
     def C_bn(self) -> Array:
-        """East, north and up of the pose as columns, body axes, shape (3, 3)."""
+        """East, north and up of the pose as columns in body axes, shape (3, 3)."""
         up, east = vector(self.up), vector(self.east)
         return np.stack([east, np.cross(up, east), up], axis=1)
 
@@ -122,7 +118,7 @@ class Procedure(Model):
 
     @property
     def steps(self) -> tuple[Step, ...]:
-        """The rotations in order."""
+        """Rotations in order."""
         return tuple(
             Step(
                 pose.id if pose.repeats == 1 else f"{pose.id}-{k + 1}",
@@ -137,7 +133,7 @@ class Procedure(Model):
         )
 
     def rotation_limits(self, step: Step) -> acceptance.RotationLimits:
-        """Limits of the rotation of a step, as `rejection_reasons` and `navigate_rotations` take them.
+        """Return the limits of the rotation of a step, for `rejection_reasons` and `navigate_rotations`.
 
         Parameters
         ----------
