@@ -32,7 +32,7 @@ from imudrv.service.monitor import monitor
 from imudrv.service.printer import Printer
 from imudrv.service.runtime import SignalFlags
 from imudrv.service.settings import Settings
-from imudrv.service.status import EXIT_CODES, Status
+from imudrv.service.status import EXIT_CODES
 from imudrv.service.status_socket import ask
 from imudrv.sim import scenario as scenarios
 from imudrv.sim.capture import record
@@ -291,13 +291,12 @@ def _monitor(arguments: argparse.Namespace) -> None:
 
 
 def _status(arguments: argparse.Namespace) -> int:
-    document = ask(arguments.status or settings.default_status_path())
-    status = Status.from_json(document)
+    status = ask(arguments.status or settings.default_status_path())
     if arguments.json:
-        print(json.dumps(document, indent=1))
+        print(json.dumps(status, indent=1))
     else:
-        print("\n".join([status.health, *status.reasons]))
-    return EXIT_CODES[status.health]
+        print("\n".join([status["health"], *status["reasons"]]))
+    return EXIT_CODES[status["health"]]
 
 
 def _doctor(arguments: argparse.Namespace) -> int:

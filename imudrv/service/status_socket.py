@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from imudrv.errors import InputError
-from imudrv.service.status import FORMAT
+from imudrv.service.status import FORMAT, VERSION
 
 MAX_STATUS: Final = 1 << 20
 """Largest status that a client accepts, bytes."""
@@ -117,6 +117,6 @@ def ask(path: Path) -> dict[str, Any]:
         status = json.loads(data)
     except ValueError:
         status = None
-    if not isinstance(status, dict) or status.get("format") != FORMAT:
-        raise InputError(f"{path}: expected the status of a service, got {bytes(data[:40])!r}")
+    if not isinstance(status, dict) or (status.get("format"), status.get("version")) != (FORMAT, VERSION):
+        raise InputError(f"{path}: expected {FORMAT} version {VERSION}, got {bytes(data[:40])!r}")
     return status

@@ -1,6 +1,7 @@
 import os
 import pty
 import tty
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from imudrv.records import PULSES
 from imudrv.service.loop import POLL_NS, Service
 from imudrv.service.settings import Settings
 from imudrv.service.status import Status
+from imudrv.service.status_socket import StatusServer, ask
 from imudrv.sim.scenario import NOMINAL
 from imudrv.units import NS_PER_S
 from imudrv.wire.encode import StreamEncoder
@@ -85,3 +87,14 @@ def test_a_status_is_the_same_after_json_and_one_of_another_program_is_refused(t
     del document["port"]["state"]
     with pytest.raises(InputError, match=r"status: port\.state: Field required; restart the service"):
         Status.from_json(document)
+
+
+def test_a_status_of_another_version_is_refused(tmp_path: Path) -> None:
+    server = StatusServer(tmp_path / "socket")
+    with ThreadPoolExecutor(1) as pool:
+        answer = pool.submit(ask, tmp_path / "socket")
+        while not answer.done():
+            server.poll(b'{"format": "imu50-status", "version": 2}\n')
+    server.close()
+    with pytest.raises(InputError, match=r"socket: expected imu50-status version 1, got b'.*\"version\": 2"):
+        answer.result()
