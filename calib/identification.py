@@ -66,8 +66,8 @@ class EstimationOptions:
     def __post_init__(self) -> None:
         if self.method == "plain" and (self.pivot == "fixed" or self.nine or self.extra):
             raise InputError(
-                "method plain: expected neither a known pivot, nor nine components, nor more unknowns: it "
-                "solves V = H R and nothing else; use method joint"
+                "method plain: expected pivot free, six components and no extra parameters, as it solves "
+                "V = H R only; use method joint"
             )
 
 
@@ -284,7 +284,7 @@ def identify(
         priors,
         tuple(sources),
         datetime.now(UTC).replace(microsecond=0),
-        f"imu50 {version('imu50')}",
+        software(),
     )
 
 
@@ -336,6 +336,11 @@ def prior_calibration(
             model, f"calibration in {path.name}", hashlib.sha256(text.encode()).hexdigest()
         )
     raise InputError("captures: expected one file at least, got none")
+
+
+def software() -> str:
+    """Return name and version of the software."""
+    return f"imu50 {version('imu50')}"
 
 
 class _Shared(NamedTuple):

@@ -14,11 +14,17 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.certificate import certificate, software
+from calib.certificate import certificate
 from calib.detection.blocks import BLOCK_NS
 from calib.estimation.joint import estimate_joint
 from calib.estimation.runs import CaptureRuns, NavigationOptions, Priors, Run, navigate_rotations
-from calib.identification import CaptureSummary, IdentificationResult, PriorCalibration, Temperature
+from calib.identification import (
+    CaptureSummary,
+    IdentificationResult,
+    PriorCalibration,
+    Temperature,
+    software,
+)
 from calib.procedure.schema import Procedure, Step
 from imudrv.calibration import Calibration, coefficients
 from imudrv.errors import InputError

@@ -102,7 +102,7 @@ def test_the_options_choose_the_method(here: Path, result: IdentificationResult)
     )
     assert plain.result.method == "plain"
     assert result.result.method == "joint"
-    with pytest.raises(InputError, match="method plain: expected neither a known pivot"):
+    with pytest.raises(InputError, match="method plain: expected pivot free, six components"):
         calib.EstimationOptions("plain", pivot="fixed")
 
 

@@ -268,7 +268,7 @@ def test_the_plain_method_and_a_gauge_by_name(here: Path, capsys: pytest.Capture
         ([*CAPTURES, "--unit", "50-0018"], "expected the calibration of unit '50-0018'"),
         (
             [*CAPTURES, "--method", "plain", "--pivot", "fixed"],
-            "method plain: expected neither a known pivot",
+            "method plain: expected pivot free, six components",
         ),
         (["z.raw", "x.raw", "z.raw"], "expected another capture, got that of z.raw once more"),
         (["z.raw"], "add rotations with another axis up"),
