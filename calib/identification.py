@@ -319,12 +319,14 @@ def prior_calibration(
     for path in map(Path, captures):
         text = Recording(path).calibration_text if path.suffix == ".mcap" else None
         if text is None:
-            raise InputError(f"{path}: expected a calibration, got a capture without one; use --calibration")
+            raise InputError(
+                f"{path}: expected a calibration, got a capture without one; give its file (--calibration)"
+            )
         texts.setdefault(text, path)
     if len(texts) > 1:
         raise InputError(
             "expected recordings made with one calibration, got different ones in "
-            f"{' and '.join(map(str, texts.values()))}; choose one with --calibration"
+            f"{' and '.join(map(str, texts.values()))}; give the right one (--calibration)"
         )
     for text, path in texts.items():
         model = settings_file.parse_text(text.encode(), Calibration, f"{path}: calibration")

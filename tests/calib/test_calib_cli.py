@@ -145,8 +145,7 @@ def test_recordings_bring_their_own_profile_and_calibration(
     assert "z.mcap: expected a recording of unit '50-0018', got one of '50-0017'" in capsys.readouterr().err
     assert main(["identify", "z.mcap", "x.raw", "--site", "site.yaml", "-o", "never.yaml"]) == 2
     assert (
-        "x.raw: expected a calibration, got a capture without one; use --calibration"
-        in capsys.readouterr().err
+        "x.raw: expected a calibration, got a capture without one; give its file" in capsys.readouterr().err
     )
 
 
