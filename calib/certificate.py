@@ -1,13 +1,12 @@
 """The calibration file of a unit with its lever arms."""
 
 from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from calib.identification import IdentificationResult
+from calib.identification import IdentificationResult, software
 from calib.lever_arms.gauge import LeverArms
 from calib.result_file import inputs_document, outcome_document
 from imudrv.arrays import Array
@@ -172,11 +171,6 @@ def write(path: Path, calibration: Calibration) -> None:
     """
     check_target(path, calibration)
     write_calibration(path, calibration)
-
-
-def software() -> str:
-    """Return name and version of the software."""
-    return f"imu50 {version('imu50')}"
 
 
 def _row(values: Array) -> Any:

@@ -66,8 +66,8 @@ class EstimationOptions:
     def __post_init__(self) -> None:
         if self.method == "plain" and (self.pivot == "fixed" or self.nine or self.extra):
             raise InputError(
-                "method plain: expected neither a known pivot, nor nine components, nor more unknowns: it "
-                "solves V = H R and nothing else; use method joint"
+                "method plain: expected pivot free, six components and no extra parameters, as it solves "
+                "V = H R only; use method joint"
             )
 
 
@@ -284,7 +284,7 @@ def identify(
         priors,
         tuple(sources),
         datetime.now(UTC).replace(microsecond=0),
-        f"imu50 {version('imu50')}",
+        software(),
     )
 
 
@@ -319,12 +319,14 @@ def prior_calibration(
     for path in map(Path, captures):
         text = Recording(path).calibration_text if path.suffix == ".mcap" else None
         if text is None:
-            raise InputError(f"{path}: expected a calibration, got a capture without one; use --calibration")
+            raise InputError(
+                f"{path}: expected a calibration, got a capture without one; give its file (--calibration)"
+            )
         texts.setdefault(text, path)
     if len(texts) > 1:
         raise InputError(
             "expected recordings made with one calibration, got different ones in "
-            f"{' and '.join(map(str, texts.values()))}; choose one with --calibration"
+            f"{' and '.join(map(str, texts.values()))}; give the right one (--calibration)"
         )
     for text, path in texts.items():
         model = settings_file.parse_text(text.encode(), Calibration, f"{path}: calibration")
@@ -336,6 +338,11 @@ def prior_calibration(
             model, f"calibration in {path.name}", hashlib.sha256(text.encode()).hexdigest()
         )
     raise InputError("captures: expected one file at least, got none")
+
+
+def software() -> str:
+    """Return name and version of the software."""
+    return f"imu50 {version('imu50')}"
 
 
 class _Shared(NamedTuple):

@@ -15,11 +15,17 @@ from numpy.typing import NDArray
 
 from calib.bench.entries import ResidualVelocity
 from calib.bench.state import Attempt, SessionState
-from calib.certificate import certificate, software
+from calib.certificate import certificate
 from calib.detection.blocks import BLOCK_NS
 from calib.estimation.joint import estimate_joint
 from calib.estimation.runs import CaptureRuns, NavigationOptions, Priors, Run, navigate_rotations
-from calib.identification import CaptureSummary, IdentificationResult, PriorCalibration, Temperature
+from calib.identification import (
+    CaptureSummary,
+    IdentificationResult,
+    PriorCalibration,
+    Temperature,
+    software,
+)
 from calib.procedure.schema import VERIFICATION, Procedure
 from imudrv.calibration import Calibration, coefficients
 from imudrv.errors import InputError

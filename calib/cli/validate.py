@@ -7,22 +7,18 @@ from typing import Final
 
 from rich.console import Console
 
+from calib.api import validate
 from calib.certificate import lever_arms_of
 from calib.cli.arguments import check_output
 from calib.reports.html import as_html
 from calib.reports.text import as_text, for_terminal
 from calib.reports.validation import document
-from calib.validation.navigate import navigate
 from calib.validation.simulate import TRIALS, campaign, dither_trials, skew_trials
-from calib.validation.trial import Trial, TrialSettings
+from calib.validation.trial import Trial
 from calib.validation.verdict import TrialMetrics, evaluate
-from imudrv import profiles
 from imudrv.calibration import Calibration, read_calibration
-from imudrv.capture import Capture
 from imudrv.errors import InputError
-from imudrv.files import settings_file
 from imudrv.files.atomic import atomic_write
-from imudrv.site import Site
 from imudrv.terminal import OK, progress
 
 NOT_GOOD: Final = 3
@@ -74,20 +70,19 @@ def _navigated(arguments: argparse.Namespace) -> tuple[Calibration, list[tuple[T
         raise InputError("validate: expected --calibration and --site with recordings")
     calibration = read_calibration(arguments.calibration)
     lever_arms_of(calibration, str(arguments.calibration))
-    site = settings_file.read(arguments.site, Site)
-    profile = profiles.load(arguments.profile) if arguments.profile else None
     found = []
     for path in arguments.recordings:
-        capture = Capture(path, profile, arguments.channel)
-        setting = TrialSettings(
-            capture.layout,
-            calibration,
-            site,
-            arguments.align,
-            arguments.rate_filter,
-            arguments.skew_ms * 1e-3,
-        )
-        with progress(path.name, capture.size) as advance:
-            trial = navigate(path.name, capture.pulses(advance), setting)
-        found.append((trial, evaluate(trial)))
+        with progress(path.name, path.stat().st_size if path.exists() else 0) as advance:
+            validation = validate(
+                path,
+                calibration=calibration,
+                site=arguments.site,
+                profile=arguments.profile,
+                align_s=arguments.align,
+                rate_filter=arguments.rate_filter,
+                skew_s=arguments.skew_ms * 1e-3,
+                channel=arguments.channel,
+                advance=advance,
+            )
+        found.append((validation.trial, validation.metrics))
     return calibration, found

@@ -9,6 +9,23 @@ from imudrv.records import Records
 from imudrv.units import NS
 from imudrv.vectors import Vector
 
+BLOCK_NS: Final = 20_000_000
+"""Length of a block, ns."""
+
+
+BLOCK: Final = np.dtype(
+    [
+        ("index", np.int64),  # of the block, by the counter
+        ("samples", np.int64),
+        ("interval_ns", np.int64),
+        ("dtheta_b", np.float64, 3),
+        ("dv_b", np.float64, 3),
+        ("angle", np.float64, 3),  # sum over the samples of the angle since the block's beginning
+        ("velocity", np.float64, 3),  # likewise
+        ("flags", np.int64),  # of any sample
+    ]
+)
+
 
 class Block(NamedTuple):
     """20 ms of samples."""
@@ -98,24 +115,6 @@ class BlockSplitter:
             Block(rows[a:b], at, s, tuple(w), tuple(f), bits, lost, empty, restarted and not a)
             for a, b, at, s, w, f, bits, lost, empty in zip(*columns, strict=True)
         ]
-
-
-BLOCK_NS: Final = 20_000_000
-"""Length of a block, ns."""
-
-
-BLOCK: Final = np.dtype(
-    [
-        ("index", np.int64),  # of the block, by the counter
-        ("samples", np.int64),
-        ("interval_ns", np.int64),
-        ("dtheta_b", np.float64, 3),
-        ("dv_b", np.float64, 3),
-        ("angle", np.float64, 3),  # sum over the samples of the angle since the block's beginning
-        ("velocity", np.float64, 3),  # likewise
-        ("flags", np.int64),  # of any sample
-    ]
-)
 
 
 def join_blocks(block: Records, more: Records) -> None:

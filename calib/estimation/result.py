@@ -19,6 +19,10 @@ OBSERVABLE_RATIO: Final = 0.5
 """A parameter is unobservable if its posterior sigma exceeds this fraction of its prior."""
 
 
+REST_H_LIMIT: Final = 2e-3
+"""Largest H at the end of a rest, m/s per m, of a unit without residual dither or vibration."""
+
+
 def _shift_free() -> Array:
     basis: Array = np.linalg.svd(np.tile(np.eye(3), (3, 1)))[0][:, 3:]
     return basis
@@ -218,7 +222,3 @@ class LeverArmEstimate:
                 "and record again"
             )
         return tuple(refusals)
-
-
-REST_H_LIMIT: Final = 2e-3
-"""H at the end of a rest, m/s per m, above which the gyros' increments are not those of a unit at rest."""

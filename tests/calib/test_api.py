@@ -102,7 +102,7 @@ def test_the_options_choose_the_method(here: Path, result: IdentificationResult)
     )
     assert plain.result.method == "plain"
     assert result.result.method == "joint"
-    with pytest.raises(InputError, match="method plain: expected neither a known pivot"):
+    with pytest.raises(InputError, match="method plain: expected pivot free, six components"):
         calib.EstimationOptions("plain", pivot="fixed")
 
 
@@ -113,7 +113,10 @@ def test_one_capture_is_a_list_of_one(here: Path) -> None:
 
 @pytest.mark.parametrize(
     ("captures", "message"),
-    [([], "captures: expected one file at least, got none"), (["z_up.raw"], "use --calibration")],
+    [
+        ([], "captures: expected one file at least, got none"),
+        (["z_up.raw"], "expected a calibration, got a capture without one"),
+    ],
 )
 def test_without_a_calibration_the_captures_have_to_contain_one(
     here: Path, captures: list[str], message: str

@@ -110,9 +110,9 @@ def test_plain_finds_them_as_the_literature_does(captured: tuple[list[Run], Arra
 
 def test_compensation_takes_nearly_all_of_the_velocity(captured: tuple[list[Run], Array]) -> None:
     for run in estimate_joint(captured[0]).runs:
-        # left is what bias and misalignment do in 3 s
+        # the residual is the effect of bias and misalignment in 3 s
         assert np.hypot(*run.compensated_n[:2]) < 0.05 * np.hypot(*run.V_n[:2])
-        # what the estimate says of the velocity fits it within noise, a random walk over 25 s
+        # the fitted velocity agrees within noise, a random walk over 25 s
         assert np.abs(run.v_n - run.fitted_n).max() < 1e-3
         assert len(run.t_s) == len(run.v_n) == len(run.fitted_n)
     assert [run.axis for run in estimate_joint(captured[0]).runs] == ["+Z", "+X", "+Y"]
@@ -143,7 +143,7 @@ def test_nine_components_without_a_known_pivot_are_refused(simulated: tuple[list
     )
 
 
-def test_rotations_about_too_few_axes_are_refused_with_the_directions_unseen(
+def test_rotations_about_too_few_axes_are_refused_with_the_unobservable_directions(
     simulated: tuple[list[Run], Array],
 ) -> None:
     runs = simulated[0]
@@ -210,7 +210,7 @@ def test_many_units_are_found_as_well_as_predicted(
         assert low < found.nees < high
         # a scatter from 6 * cases independent numbers: 1 / sqrt(12 cases) = 8 to 10 %, three times
         assert found.ratio == pytest.approx(1.0, abs=0.31)
-    # 500 degrees of freedom a case: what is left is how well each case tells its noise, some 10 % in sigma
+    # 500 degrees of freedom a case: the rest is how well each case determines its noise, some 10 % in sigma
     assert of_joint.chi_square_per_degree == pytest.approx(1.0, abs=0.2)
     if len(signs) == 2:  # six equations are over, mean square 1, their mean sqrt(2 / 6 cases); three times
         assert of_plain.chi_square_per_degree == pytest.approx(1.0, abs=0.62)
@@ -266,7 +266,7 @@ def shaken(amplitude_arcsec: float, frequency_hz: float) -> tuple[list[Run], Arr
 
 
 @pytest.mark.parametrize("amplitude_arcsec", [3.0, 100.0])
-def test_dither_of_the_blocks_left_in_the_increments_does_no_harm(amplitude_arcsec: float) -> None:
+def test_residual_dither_in_the_increments_does_no_harm(amplitude_arcsec: float) -> None:
     runs, truth = shaken(amplitude_arcsec, 400.0)
     found = estimate_joint(runs)
     assert found.refusals == ()
@@ -328,7 +328,7 @@ def test_a_plan_that_cannot_do_is_refused(plan: Sequence[PlannedRotation], messa
         predict(plan, LATITUDE, Noise(6e-7, 5e-5, 5e-6, 1.4e-4))
 
 
-def test_the_direction_that_a_plan_does_not_see_is_named() -> None:
+def test_the_directions_that_a_plan_does_not_determine_are_named() -> None:
     # with Y never up, how z_X and x_Z lie to the others turns no level velocity out of its direction
     with pytest.raises(InputError) as caught:
         predict((THREE[0], THREE[1]), LATITUDE, Noise(6e-7, 5e-5, 5e-6, 1.4e-4))
@@ -371,18 +371,18 @@ def test_a_pivot_that_did_not_stay_still_is_refused(
     assert "expected the origin of b to stay still, but the velocities contradict it: chi-square" in message
 
 
-def test_what_the_data_cannot_tell_is_said(simulated: tuple[list[Run], Array]) -> None:
+def test_unobservable_parameters_are_noted(simulated: tuple[list[Run], Array]) -> None:
     found = estimate_joint(simulated[0], extra=("quadratic",))
     # a quadratic term is a bias where one axis is always up
     assert len(found.notes) == 3
     assert found.notes[0].startswith("quadratic_x not observable in these runs: sigma ")
     assert found.notes[0].endswith(" ug/g^2")
-    # and what cannot be told does no harm
+    # and unobservable parameters do no harm
     np.testing.assert_allclose(found.R_b, estimate_joint(simulated[0]).R_b, atol=1e-3 * MM)
     assert estimate_joint(simulated[0]).notes == ()
 
 
-def test_a_skew_is_seen_with_a_known_pivot(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_skew_is_observable_with_a_known_pivot(monkeypatch: pytest.MonkeyPatch) -> None:
     scenario = montecarlo.scenario
 
     def skewed(*arguments: Any) -> Any:

@@ -76,13 +76,13 @@ def test_each_rejection_has_its_number_and_its_limit(
     assert reason in rejection_reasons(rotation, LIMITS)
 
 
-def test_another_axis_than_the_procedure_wants_is_told(bench: Bench, step: Step) -> None:
+def test_another_axis_than_that_of_the_procedure_is_reported(bench: Bench, step: Step) -> None:
     rotation = only(find_segments([bench(step(40.0), step(2.5, 180.0), step(8.0), up="+Y")]))
     assert rejection_reasons(rotation, LIMITS, expected="Y") == ()
     assert rejection_reasons(rotation, LIMITS, expected="Z") == ("about Y, expected Z",)
 
 
-def test_missing_samples_and_flags_in_the_rotation_are_told(bench: Bench, step: Step) -> None:
+def test_missing_samples_and_flags_in_the_rotation_are_reported(bench: Bench, step: Step) -> None:
     data = bench(step(40.0), step(2.5, 180.0), step(8.0))
     turning = 41 * 500
     kept = np.delete(data, [turning, turning + 40, turning + 41])
@@ -130,7 +130,7 @@ def test_two_pushes_with_a_short_pause_are_one_rotation(bench: Bench, step: Step
     assert rejection_reasons(only(find_segments([data])), LIMITS) == ()
 
 
-def test_two_pushes_with_a_rest_between_are_two_that_do_not_serve(bench: Bench, step: Step) -> None:
+def test_two_pushes_with_a_rest_between_are_both_rejected(bench: Bench, step: Step) -> None:
     data = bench(step(40.0), step(1.3, 90.0), step(3.0), step(1.3, 90.0), step(8.0))
     first, second = (rejection_reasons(r, LIMITS) for r in find_segments([data]).rotations)
     assert first == ("turned 90.0 deg, want 180 +- 5", "rest after 3.0 s, want 5")

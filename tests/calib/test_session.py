@@ -26,6 +26,7 @@ from calib.bench.session import Session
 from calib.bench.state import JOURNAL
 from calib.bench.verify import verify
 from calib.procedure.events import Entered, Finished, Phase, Redone
+from calib.procedure.messages import Message, english
 from imudrv.calibration import write_calibration
 from imudrv.errors import InputError
 from imudrv.files import atomic, settings_file
