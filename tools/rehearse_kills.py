@@ -44,6 +44,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     arguments = parser.parse_args()
     folder = arguments.folder or Path(tempfile.mkdtemp(prefix="rehearse-kills-"))
+    folder.mkdir(parents=True, exist_ok=True)
     moments = random.Random(arguments.seed)
 
     begun = time.monotonic()
