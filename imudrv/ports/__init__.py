@@ -2,11 +2,11 @@
 
 =====================================================  ====================================================
 ``serial:///dev/ttyUSB0``, ``/dev/ttyUSB0``, ``COM3``  serial line, settings from the profile
-``serial:///dev/serial/by-id/usb-FTDI_...``            by its stable name: found again in any socket
+``serial:///dev/serial/by-id/usb-FTDI_...``            by its stable name, the same in any USB socket
 ``...?baudrate=460800&parity=even``                    other settings: ``baudrate``, ``bytesize`` 5-8,
                                                        ``parity`` none, even, odd, mark, space,
                                                        ``stopbits`` 1, 2
-``socket://HOST:PORT``                                 TCP server, as a serial-to-Ethernet box is
+``socket://HOST:PORT``                                 TCP server, such as a serial-to-Ethernet adapter
 ``rfc2217://HOST:PORT``, ``spy:///dev/ttyUSB0``,       other URLs of pyserial, with its options
 ``hwgrep://0403:6001``, ``loop://``, ``alt://``        and the settings of a line
 ``can://INTERFACE/CHANNEL``                            any interface of python-can, profile's bit rates
@@ -17,12 +17,12 @@
 ``can://virtual/NAME``                                 inside one program
 ``...?bitrate=500000&data_bitrate=2000000&fd=true``    other settings; the rest goes to python-can
 ``replay://FILE``                                      raw capture, candump log, ``.mcap`` recording
-``replay://FILE?speed=10``, ``?speed=max``             at ten times the pace; as fast as it can be read
-``replay://FILE?channel=can0``                         one channel of a candump log that has several
+``replay://FILE?speed=10``, ``?speed=max``             at ten times the speed; as fast as it can be read
+``replay://FILE?channel=can0``                         one channel of a candump log with several
 ``sim://SCENARIO.yaml``, ``sim://rocking?speed=max``   simulated unit; a file, or a shipped scenario's name
 =====================================================  ====================================================
 
-Values in a query are percent-decoded, an address is taken as it stands up to the first ``?``.
+Values in a query are percent-decoded; an address is taken literally, up to the first ``?``.
 """
 
 from collections.abc import Callable
@@ -45,25 +45,25 @@ def open_port(url: str, profile: Profile) -> Port:
     url : str
         See the table of this module.
     profile : Profile
-        What the unit sends: line settings, identifiers, and how to read a capture.
+        Profile of the unit: line settings, identifiers, layout of a capture.
 
     Returns
     -------
     Port
-        Ready to be read.
+        The open port.
 
     Raises
     ------
     InputError
-        The URL makes no sense, or not with this profile; trying again does not help.
+        The URL is not valid, or not with this profile; a retry does not help.
     PortLostError
-        The device is not there, or not for us, now.
+        The device is absent, in use or not permitted at the moment.
     """
     return _opener(url, profile)()
 
 
 def check_url(url: str, profile: Profile) -> None:
-    """Tell mistakes in a URL without opening any device.
+    """Check a URL without opening a device.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def check_url(url: str, profile: Profile) -> None:
     Raises
     ------
     InputError
-        As `open_port` would raise it, as far as can be told before the device is there.
+        As `open_port` would raise it, as far as it is known without the device.
     """
     opener = _opener(url, profile)
     if split(url).scheme == "sim":  # no device: opening it is the check
@@ -81,7 +81,7 @@ def check_url(url: str, profile: Profile) -> None:
 
 
 def _opener(url: str, profile: Profile) -> Callable[[], Port]:
-    """Check a URL; what opens it. Libraries are loaded only where they are needed."""
+    """Check a URL and return what opens it; libraries are loaded only where needed."""
     parts = split(url)
     if parts.scheme == "serial" or parts.scheme in PYSERIAL:
         from imudrv.ports import serial

@@ -1,4 +1,4 @@
-"""What every port keeps to: where wire bytes or CAN messages come from, with their time of arrival."""
+"""Interface of a port, the source of wire bytes or CAN messages with their times of arrival."""
 
 from abc import ABC, abstractmethod
 
@@ -7,28 +7,27 @@ from imudrv.records import Arrival, Source
 
 
 class PortLostError(Imu50Error):
-    """The port went away: unplugged, bus off, the other end gone. Open it again."""
+    """The port was lost: unplugged, bus off, disconnected. Open it again."""
 
 
 class PortEndedError(Imu50Error):
-    """A replay or a simulation has come to its end; nothing is wrong."""
+    """A replay or a simulation has ended; this is no fault."""
 
 
 class Port(ABC):
-    """A way in.
+    """Source of wire data.
 
-    Who stamps: the port, right after the read that brought the data returned. What blocks: `read` alone, for
-    its timeout at the most; it returns at once what is there already and never waits to gather more. How an
-    unplug shows: `read` raises `PortLostError`, in whatever form the system reported it (`OSError`,
-    `SerialException`, an empty read of a port that said it was ready). What `close` does: gives the device
-    back, as often as it is called; a `read` after it raises `PortLostError`.
+    The port stamps data right after the read that returned them. Only `read` blocks, at most for its timeout;
+    it returns available data at once and never waits for more. After an unplug `read` raises `PortLostError`,
+    however the system reports it (`OSError`, `SerialException`, an empty read of a port that was ready).
+    `close` may be called repeatedly; a `read` after it raises `PortLostError`.
 
     Parameters
     ----------
     url : str
-        What was opened, as the user gave it.
+        URL as the user gave it.
     source : Source
-        What stands behind it.
+        Kind of data source.
     """
 
     def __init__(self, url: str, source: Source) -> None:
@@ -37,7 +36,7 @@ class Port(ABC):
 
     @abstractmethod
     def read(self, timeout_s: float) -> Arrival:
-        """Wait for data.
+        """Return available data, or wait for some.
 
         Parameters
         ----------
@@ -47,16 +46,16 @@ class Port(ABC):
         Returns
         -------
         Arrival
-            What was there, as much as one read of the device gives.
+            The data of one read of the device; empty after the timeout.
 
         Raises
         ------
         PortLostError
-            The port went away.
+            The port was lost.
         PortEndedError
-            There will never be more.
+            There are no more data.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """Give the device back."""
+        """Close the device."""

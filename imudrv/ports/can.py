@@ -1,4 +1,4 @@
-"""Messages from a CAN bus, by any interface of python-can."""
+"""CAN bus of any interface that python-can knows."""
 
 import difflib
 import errno
@@ -24,26 +24,25 @@ from imudrv.ports.url import Url, require_transport, value
 from imudrv.profiles.schema import CanLine, Profile
 from imudrv.records import MESSAGE, Arrival, Records, Source
 
-# Whatever python-can logs stands in our messages too; without a handler it would go to the terminal.
+# Our messages contain what python-can logs; without a handler it would go to the terminal.
 logging.getLogger("can").addHandler(logging.NullHandler())
 
 _ROW: Final = struct.Struct("=qIBB64s2x")
-"""A row of MESSAGE; the data come out padded with zeros."""
-assert _ROW.size == MESSAGE.itemsize
+"""A row of MESSAGE; the data are padded with zeros."""
 _AT_ONCE: Final = 4096
-"""Most messages of one read."""
+"""Maximum number of messages of one read."""
 _BUFFER_BYTES: Final = 1 << 22
-"""Asked of the system for a socket: its usual 200 kB hold 0.1 s of messages."""
+"""Receive buffer requested for a socket; the usual 200 kB hold only 0.1 s of messages."""
 _ID_MASK: Final = 0x1FFFFFFF
 _BUS_OFF: Final = 0x40
 """Bit in the identifier of an error frame (linux/can/error.h)."""
 _RESERVED: Final = ("interface", "channel", "can_filters", "config_context", "ignore_config", "timing")
 _TIMED: Final = ("pcan", "slcan")
-"""Interfaces that learn a data bit rate only from a whole bit timing."""
+"""Interfaces that take a data bit rate only as a complete bit timing."""
 _ARPHRD_CAN: Final = "280"
 
 
-def prepare(url: Url, profile: Profile) -> Callable[[], Port]:
+def prepare(url: Url, profile: Profile) -> "Callable[[], CanPort]":
     """Check a ``can://`` URL.
 
     Parameters
@@ -51,17 +50,17 @@ def prepare(url: Url, profile: Profile) -> Callable[[], Port]:
     url : Url
         ``can://INTERFACE/CHANNEL``.
     profile : Profile
-        Of a CAN unit; its bit rates hold where the URL has none, and only its identifiers are received.
+        Profile of a CAN unit: default bit rates, and the only identifiers that are received.
 
     Returns
     -------
     callable
-        Opens the port; raises `PortLostError` when the bus is not there.
+        Opens the port; raises `PortLostError` if the bus is absent.
 
     Raises
     ------
     InputError
-        It makes no sense.
+        The URL is not valid.
     """
     require_transport(url, profile, "can")
     interface, _, channel = url.address.partition("/")
@@ -74,7 +73,7 @@ def prepare(url: Url, profile: Profile) -> Callable[[], Port]:
     options: dict[str, Any] = {name: value(text) for name, text in url.options.items()}
     if taken := [name for name in options if name in _RESERVED]:
         raise InputError(
-            f"{url.text}: expected other options, got {', '.join(taken)}; the URL or profile says it"
+            f"{url.text}: expected other options, got {', '.join(taken)}; the URL or the profile sets these"
         )
     fd = options.pop("fd", profile.fd)
     if not isinstance(fd, bool):
@@ -87,14 +86,14 @@ def prepare(url: Url, profile: Profile) -> Callable[[], Port]:
 
 
 class CanPort(Port):
-    """A CAN bus; error and remote frames are left out.
+    """CAN bus; error and remote frames are dropped.
 
     Parameters
     ----------
     url : str
         As the user gave it.
     bus : can.BusABC
-        Open; shut down by `close`.
+        Open bus, shut down by `close`.
     """
 
     def __init__(self, url: str, bus: can.BusABC) -> None:
@@ -103,7 +102,7 @@ class CanPort(Port):
         self._closed = False
 
     def read(self, timeout_s: float) -> Arrival:
-        """See `Port.read`; each message has the time when it was taken in."""
+        """See `Port.read`; each message has its own time of arrival."""
         if self._closed:
             raise PortLostError(f"{self.url}: the port is closed")
         rows = []
@@ -118,7 +117,7 @@ class CanPort(Port):
             message = self._receive(0) if len(rows) < _AT_ONCE else None
         if not rows and self._is_off():
             raise self._bus_off()
-        # A bytearray, because arrays on bytes are read-only and would be another type to the kernels.
+        # A bytearray: arrays over bytes are read-only, which is another type for the kernels.
         messages: Records = np.frombuffer(bytearray().join(rows), MESSAGE)
         return Arrival(now_ns(), messages)
 
@@ -129,7 +128,7 @@ class CanPort(Port):
         self._closed = True
         with suppress(Exception):  # a driver may raise anything
             self.bus.shutdown()
-        # A serial adapter that is gone cannot be told to stop; shutdown gives up before it closes the device.
+        # If a serial adapter is unplugged, shutdown fails to stop it and does not close the device.
         device = getattr(self.bus, "serialPortOrig", None)
         if device is not None:
             device.close()
@@ -149,10 +148,10 @@ class CanPort(Port):
         try:
             return self.bus.recv(timeout_s)
         except (ValueError, IndexError):
-            return None  # an adapter's line that is no message
+            return None  # a line of the adapter that is no message
         except Exception as error:  # a driver may raise anything
             if str(error) == "could not unpack received message":
-                return None  # a stranger's datagram
+                return None  # a datagram of another program
             raise PortLostError(f"{self.url}: {_in_words(error)}") from error
 
 
@@ -169,7 +168,7 @@ def _rates(url: Url, interface: str, line: CanLine, fd: bool) -> dict[str, Any]:
     return {"fd": True, "timing": timing}
 
 
-def _open(url: str, interface: str, channel: str, options: dict[str, Any]) -> Port:
+def _open(url: str, interface: str, channel: str, options: dict[str, Any]) -> CanPort:
     try:
         bus = can.Bus(channel, interface, ignore_config=True, **options)
     except NotImplementedError as error:
@@ -201,14 +200,16 @@ def _why_not(interface: str, channel: str, error: Exception) -> str:
         if error.errno == errno.ENODEV:
             return f"there is no CAN interface {channel}; {_interfaces_there_are()}"
         if error.errno == errno.EAFNOSUPPORT:
-            return "this system's kernel has no CAN (module can_raw)"
+            return "the kernel has no CAN support (module can_raw)"
     return f"cannot open it: {_in_words(error)}"
 
 
 def _interfaces_there_are() -> str:
     kinds = sorted(Path("/sys/class/net").glob("*/type"))
     names = [kind.parent.name for kind in kinds if kind.read_text().strip() == _ARPHRD_CAN]
-    return f"there are {', '.join(names)}" if names else "there is none at all: is the adapter plugged in?"
+    return (
+        f"there are {', '.join(names)}" if names else "there is no CAN interface: is the adapter plugged in?"
+    )
 
 
 def _in_words(error: Exception) -> str:

@@ -1,13 +1,13 @@
-"""What was recorded, once more: a raw capture, a candump log, a recording.
+"""Replay of a raw capture, a candump log or a recording.
 
-At a given speed the pieces come when they are due, by deadlines counted from the first one; a piece is what
-one millisecond of real time brings, or one read of a recording. With ``max`` they come as fast as they can be
-read, in large pieces.
+At a given speed each chunk is returned when it is due, by deadlines relative to the first one; a chunk is one
+millisecond of real time, or one read of a recording. With ``max`` the file is read as fast as possible, in
+large chunks.
 
-Each piece has the time of its end: of a log and a recording the recorded one; of a raw capture, which has
-none, the sample interval times the frames of the profile that the bytes up to there make, from 0 on. So a
-replay at a given speed brings the same pieces with the same times whenever it is run, and a message or a read
-of a recording has the same time at any speed.
+A chunk has the time of its end. A log and a recording contain times; in a raw capture, which does not, the
+time is the sample interval times the number of frames up to there, from 0 on. So every replay at a given
+speed returns the same chunks with the same times, and a message or a read of a recording has the same time at
+any speed.
 """
 
 import math
@@ -42,19 +42,19 @@ def prepare(url: Url, profile: Profile) -> Callable[[], Port]:
     Parameters
     ----------
     url : Url
-        ``replay://FILE``; with ``channel`` that of a candump log to read, needed where the log has several.
+        ``replay://FILE``; option ``channel`` selects one channel of a candump log with several.
     profile : Profile
-        What the file holds; a CAN profile reads candump logs, another one raw captures.
+        Profile of the data; a CAN profile reads candump logs, other profiles raw captures.
 
     Returns
     -------
     callable
-        Opens the port; raises `InputError` where the file turns out to be another one.
+        Opens the port; raises `InputError` if the file has another format.
 
     Raises
     ------
     InputError
-        It makes no sense, or the file is not there or empty.
+        The URL is not valid, or the file does not exist or is empty.
     """
     path, layout = Path(url.address), profile.layout()
     is_log = layout.can and path.suffix != ".mcap"
@@ -80,18 +80,18 @@ def prepare(url: Url, profile: Profile) -> Callable[[], Port]:
 
 
 class ReplayPort(Port):
-    """Pieces of a file, at their pace.
+    """Replay of a file, in real time or faster.
 
     Parameters
     ----------
     url : str
         As the user gave it.
     pieces : generator of Arrival
-        In the order of the file; closed by `close`.
+        Chunks in the order of the file; closed by `close`.
     speed : float or None
-        Times the recorded pace; None: no pace.
+        Factor on the recorded speed; None: as fast as possible.
     nothing : bytes or ndarray of MESSAGE
-        What a read brings when nothing was due.
+        Data of a read when nothing was due.
     """
 
     def __init__(self, url: str, pieces: Pieces, speed: float | None, nothing: bytes | Records) -> None:
@@ -105,7 +105,7 @@ class ReplayPort(Port):
         self._closed = False
 
     def read(self, timeout_s: float) -> Arrival:
-        """See `Port.read`; the pace counts from the first read."""
+        """See `Port.read`; the first read starts the clock."""
         if self._closed:
             raise PortLostError(f"{self.url}: the port is closed")
         if self._piece is None:
@@ -126,17 +126,17 @@ class ReplayPort(Port):
         except StopIteration:
             raise PortEndedError(f"{self.url}: the end of the file") from None
         except OSError as error:
-            raise InputError(f"{self.url}: cannot read on: {error.strerror or error}") from error
+            raise InputError(f"{self.url}: cannot continue to read: {error.strerror or error}") from error
 
     def _is_due(self, piece: Arrival, timeout_s: float, speed: float) -> bool:
-        """Wait for the piece, but not longer than the timeout."""
+        """Wait for the chunk, at most for the timeout; return whether it is due."""
         left_s = (piece.t_ns - self._reached_ns(speed)) * NS / speed
         if left_s > 0:
             time.sleep(min(left_s, timeout_s))
         return left_s <= timeout_s
 
     def _reached_ns(self, speed: float) -> int:
-        """How far the replay is, recorded time."""
+        """Return the recorded time that the replay has reached."""
         now = now_ns()
         if self._begin_ns is None:
             self._begin_ns = now

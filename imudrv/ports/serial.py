@@ -1,7 +1,7 @@
-"""Bytes from a serial line, or from whatever pyserial takes for one.
+"""Serial line, or any other device that pyserial can open.
 
-A device with a descriptor (a line, a pty, a TCP connection) is read with `select` and one read of the system,
-the quickest way there is; the others as pyserial reads them.
+A device with a file descriptor (line, pty, TCP connection) is read with `select` and one `read`, which has
+the lowest latency; other devices are read by pyserial.
 """
 
 import errno
@@ -28,7 +28,7 @@ from imudrv.records import Arrival, Source
 
 _AT_ONCE: Final = 1 << 16
 _SLICE_S: Final = 0.02
-"""Longest wait inside pyserial; its timeout cannot change while it is open without setting the line anew."""
+"""Longest wait inside pyserial, s; a change of its timeout would set up an open line again."""
 _CONNECT_S: Final = 1.0
 _PARITY: Final = {
     "none": serial.PARITY_NONE,
@@ -46,24 +46,24 @@ if os.name == "posix":
 
 
 def prepare(url: Url, profile: Profile) -> Callable[[], Port]:
-    """Check a URL of pyserial's kind.
+    """Check a URL of pyserial.
 
     Parameters
     ----------
     url : Url
-        Scheme ``serial`` or one of pyserial's.
+        Scheme ``serial`` or one of pyserial.
     profile : Profile
-        Of a serial unit; its line settings hold where the URL has none.
+        Profile of a serial unit, with the default line settings.
 
     Returns
     -------
     callable
-        Opens the port; raises `PortLostError` when the device is not there.
+        Opens the port; raises `PortLostError` if the device is absent.
 
     Raises
     ------
     InputError
-        It makes no sense.
+        The URL is not valid.
     """
     require_transport(url, profile, "serial")
     if url.scheme == "socket":
@@ -82,14 +82,14 @@ def prepare(url: Url, profile: Profile) -> Callable[[], Port]:
 
 
 def explain(device: str, error: OSError) -> str:
-    """Say in plain words why a serial device cannot be opened, and what to do.
+    """Return why a serial device cannot be opened, and what to do.
 
     Parameters
     ----------
     device : str
-        Its path.
+        Path of the device.
     error : OSError
-        What the system said; pyserial's exceptions are such ones.
+        Error of the system or of pyserial.
 
     Returns
     -------
@@ -108,16 +108,16 @@ def explain(device: str, error: OSError) -> str:
 
 
 class DescriptorPort(Port):
-    """A device that the system can wait for; one read of it is one arrival.
+    """Device with a file descriptor; one read of it is one arrival.
 
-    Nothing that the device holds when it is opened is thrown away: the decoder sorts out what is no frame.
+    Bytes in the input buffer at opening are kept: the decoder rejects what is no frame.
 
     Parameters
     ----------
     url : str
         As the user gave it.
     device : Serial or socket
-        Open and not blocking; closed by `close`.
+        Open device, not blocking, closed by `close`.
     """
 
     def __init__(self, url: str, device: serial.Serial | socket.socket) -> None:
@@ -153,14 +153,14 @@ class DescriptorPort(Port):
 
 
 class PyserialPort(Port):
-    """A device that only pyserial can read; a read may take 20 ms longer than its timeout.
+    """Device that only pyserial can read; a read may take 20 ms longer than its timeout.
 
     Parameters
     ----------
     url : str
         As the user gave it.
     device : Serial
-        Open, with a timeout of 20 ms; closed by `close`.
+        Open device with a timeout of 20 ms, closed by `close`.
     """
 
     def __init__(self, url: str, device: serial.Serial) -> None:
@@ -195,14 +195,14 @@ def _open(url: str, target: str, line: SerialLine) -> Port:
     }
     try:
         device = serial.serial_for_url(target, do_not_open=True, **settings)
-        # Opening a POSIX device empties its buffer otherwise.
+        # Otherwise opening a POSIX device discards its input buffer.
         vars(device)["_reset_input_buffer"] = lambda: None
         device.open()
-    except KeyError as error:  # pyserial stumbles while it tells of an unknown option
+    except KeyError as error:  # raised by pyserial while it reports an unknown option
         raise InputError(f"{url}: {error.__context__ or error}") from error
     except ValueError as error:
         cause = error.__context__
-        if isinstance(cause, OSError) and cause.errno != errno.EINVAL:  # gone while its speed was set
+        if isinstance(cause, OSError) and cause.errno != errno.EINVAL:  # unplugged while its speed was set
             raise PortLostError(f"{url}: {explain(target, cause)}") from error
         raise InputError(f"{url}: {error}") from error
     except _SYSTEM_ERRORS as error:
@@ -212,13 +212,13 @@ def _open(url: str, target: str, line: SerialLine) -> Port:
         raise PortLostError(f"{url}: {explain(target, reason)}") from error
     if os.name != "posix" or not isinstance(device, serial.Serial) or target.startswith("spy:"):
         return PyserialPort(url, device)
-    with suppress(ValueError, OSError, NotImplementedError):  # ptys and some drivers have no such mode
+    with suppress(ValueError, OSError, NotImplementedError):  # not supported by ptys and some drivers
         device.set_low_latency_mode(True)
     return DescriptorPort(url, device)
 
 
 def _connect(url: str, address: tuple[str, int]) -> Port:
-    # Our own connection: pyserial's throws away what has come already, and waits 0.3 s when it closes.
+    # Not by pyserial, which discards what was received before and waits 0.3 s at closing.
     try:
         connection = socket.create_connection(address, timeout=_CONNECT_S)
     except OSError as error:
@@ -264,7 +264,7 @@ def _ports_there_are() -> str:
     named = sorted(map(str, Path("/dev/serial/by-id").glob("*")))
     names = named or sorted(port.device for port in comports())
     if not names:
-        return "there is no serial port here at all: is it plugged in?"
+        return "there is no serial port: is it plugged in?"
     more = ", ..." if len(names) > _SHOWN_PORTS else ""
     return f"there are {', '.join(names[:_SHOWN_PORTS])}{more}"
 
@@ -273,7 +273,5 @@ def _who_may(device: str) -> str:
     try:
         group = Path(device).group()
     except (OSError, KeyError):
-        return "run as a user who may open it"
-    return (
-        f"it is the group's {group}: `sudo usermod -aG {group} $USER`, then log in again, or add a udev rule"
-    )
+        return "run as a user with permission"
+    return f"its group is {group}: `sudo usermod -aG {group} $USER`, then log in again, or add a udev rule"

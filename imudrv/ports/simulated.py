@@ -1,4 +1,4 @@
-"""A simulated unit as a port, in this process: ``sim://SCENARIO.yaml?speed=1|10|max``."""
+"""Simulated unit inside this process: ``sim://SCENARIO.yaml?speed=1|10|max``."""
 
 import time
 from typing import Final
@@ -18,7 +18,7 @@ _NOTHING: Final = np.zeros(0, MESSAGE)
 
 
 def open_simulated(url: str, profile: Profile) -> Port:
-    """Open a simulated unit; its run begins now.
+    """Open a simulated unit and start its run.
 
     Parameters
     ----------
@@ -26,7 +26,7 @@ def open_simulated(url: str, profile: Profile) -> Port:
         ``sim://NAME`` of a shipped scenario or ``sim://PATH`` of a file; ``?speed=`` 1 (the default),
         any other number, or max.
     profile : Profile
-        What it sends.
+        Profile of the unit.
 
     Returns
     -------
@@ -35,7 +35,7 @@ def open_simulated(url: str, profile: Profile) -> Port:
     Raises
     ------
     InputError
-        No such scenario, one with faults, or another option.
+        The scenario does not exist or is not valid, or an option is unknown.
     """
     parts = split(url)
     options = dict(parts.options)
@@ -46,21 +46,21 @@ def open_simulated(url: str, profile: Profile) -> Port:
 
 
 class SimulatedPort(Port):
-    """A simulated unit. An unplug of the scenario is a silence here.
+    """Simulated unit; an unplug of the scenario is a silence.
 
-    At a finite speed data arrives when it is due, stamped by the host's clock; at full speed as it is read,
-    stamped with the time of the run from its beginning on.
+    At a finite speed data arrive when they are due, stamped by the host clock. At full speed they arrive as
+    fast as they are read, stamped with the time of the run.
 
     Parameters
     ----------
     url : str
         As the user gave it.
     scenario : Scenario
-        What happens.
+        Scenario to simulate.
     profile : Profile
-        What it sends.
+        Profile of the unit.
     speed : float or None
-        Seconds of the run in a second; None: as fast as it is read.
+        Speed relative to real time; None: as fast as it is read.
     """
 
     def __init__(self, url: str, scenario: Scenario, profile: Profile, speed: float | None) -> None:

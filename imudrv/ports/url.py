@@ -1,4 +1,4 @@
-"""A URL in its parts, and the mistakes that any kind of port can find in one."""
+"""Parts of a URL, and checks common to all ports."""
 
 import re
 from typing import Final, NamedTuple
@@ -12,18 +12,18 @@ SCHEMES: Final = tuple(f"{scheme}://" for scheme in ("serial", *PYSERIAL, "can",
 
 
 class Url(NamedTuple):
-    """A URL in its parts.
+    """Parts of a URL.
 
     Parameters
     ----------
     text : str
-        As the user gave it.
+        URL as the user gave it.
     scheme : str
-        Before ``://``, in small letters; ``serial`` for the bare name of a device.
+        Lower-case scheme; ``serial`` for the name of a device.
     address : str
-        Up to the query, as it stands.
+        Literal text between scheme and query.
     options : dict of str to str
-        The query.
+        Options of the query.
     """
 
     text: str
@@ -33,12 +33,12 @@ class Url(NamedTuple):
 
 
 def split(text: str) -> Url:
-    """Take a URL apart.
+    """Split a URL into its parts.
 
     Parameters
     ----------
     text : str
-        A URL, or the bare name of a serial device: ``/dev/ttyUSB0``, ``COM3``.
+        URL, or the name of a serial device: ``/dev/ttyUSB0``, ``COM3``.
 
     Returns
     -------
@@ -47,7 +47,7 @@ def split(text: str) -> Url:
     Raises
     ------
     InputError
-        It is neither, or an option is given twice or without a value.
+        The text is neither, or an option occurs twice or has no value.
     """
     before, _, query = text.partition("?")
     scheme, found, address = before.partition("://")
@@ -69,7 +69,7 @@ def split(text: str) -> Url:
 
 
 def value(text: str) -> bool | float | str:
-    """Read an option's value: true or false, a number, or the text itself."""
+    """Return the value of an option: true or false, a number, or the text itself."""
     if text in ("true", "false"):
         return text == "true"
     for number in (int, float):
@@ -81,12 +81,12 @@ def value(text: str) -> bool | float | str:
 
 
 def require_transport(url: Url, profile: Profile, transport: str) -> None:
-    """Refuse a profile of another kind of wire than the port's.
+    """Refuse a profile whose transport is not that of the port.
 
     Raises
     ------
     InputError
-        Says which URLs fit the profile.
+        The message names the URLs that fit the profile.
     """
     if profile.transport != transport:
         fitting = "can://INTERFACE/CHANNEL" if profile.transport == "can" else "serial:///dev/..."

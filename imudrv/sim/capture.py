@@ -1,4 +1,4 @@
-"""A simulated unit's output: pieces with their times, and as a terminal program or candump records it."""
+"""Output of a simulated unit: chunks with times, or a capture as a terminal program or candump records it."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -16,18 +16,18 @@ from imudrv.wire.layout import Layout
 
 
 class WireChunk(NamedTuple):
-    """What the wire carries for a stretch of samples.
+    """Wire data of consecutive samples.
 
     Parameters
     ----------
     data : bytes or ndarray of MESSAGE
-        Wire bytes, or CAN messages with `t_ns` from the beginning of the run.
+        Wire bytes, or CAN messages with `t_ns` since the start of the run.
     t_ns : ndarray of int64, shape (n,)
-        When each frame or message is sent, from the beginning of the run; never less than the one before.
+        Time of each frame or message since the start of the run, never decreasing.
     end : ndarray of int64, shape (n,)
-        Bytes or messages of `data` up to the end of each; a frame that is lost adds none.
+        Bytes or messages of `data` up to the end of each; a lost frame adds none.
     truth : ndarray of TRUTH
-        What really happened meanwhile, a row a sample.
+        Truth, one row per sample.
     """
 
     data: bytes | Records
@@ -37,21 +37,21 @@ class WireChunk(NamedTuple):
 
 
 def wire(scenario: Scenario, layout: Layout, chunk: int = 65_536) -> Iterator[WireChunk]:
-    """Simulate a scenario onto the wire of a profile, with the scenario's faults.
+    """Simulate the wire data of a scenario, with its faults, for a profile.
 
     Parameters
     ----------
     scenario : Scenario
-        What happens. Pulses that the wire cannot carry saturate.
+        Scenario. Pulses beyond the range of the wire saturate.
     layout : Layout
-        Of the profile.
+        Layout of the profile.
     chunk : int
-        Samples at a time. Any value gives the same bytes and messages.
+        Number of samples at a time; any value gives the same data.
 
     Yields
     ------
-    Piece
-        Of `chunk` samples.
+    WireChunk
+        Data of `chunk` samples.
     """
     chunks = simulate(_within(scenario, layout), layout.interval_ns, chunk)
     if layout.can:
@@ -69,7 +69,7 @@ def wire(scenario: Scenario, layout: Layout, chunk: int = 65_536) -> Iterator[Wi
 
 
 def record(scenario: Scenario, layout: Layout) -> Iterator[tuple[bytes, Records]]:
-    """Simulate a scenario into a capture.
+    """Simulate the capture of a scenario.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def record(scenario: Scenario, layout: Layout) -> Iterator[tuple[bytes, Records]
     bytes
         Wire bytes; for a CAN profile lines of a candump log.
     ndarray of TRUTH
-        What really happened meanwhile.
+        Truth of the same samples.
     """
     for piece in wire(scenario, layout):
         data = piece.data

@@ -1,7 +1,6 @@
-"""What a bad line does: frames damaged, lost, doubled; messages lost, doubled, swapped; silences.
+"""Faults of a line: frames damaged, lost, duplicated; messages lost, duplicated, swapped; silences.
 
-Random, by seed: the same seed gives the same faults, whatever pieces it is fed in. A cable that is out is a
-silence.
+The seed determines the faults, however the data are divided into chunks. An unplugged cable is a silence.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,7 +23,7 @@ _TRIES: Final = 16
 
 
 class Kind(IntEnum):
-    """What was done to a frame or message."""
+    """Kind of fault of a frame or message."""
 
     NONE = 0
     BIT_FLIPS = 1
@@ -51,17 +50,17 @@ _HARM: Final = (
 
 @dataclass(frozen=True)
 class Damage:
-    """What was done to the rows that were fed.
+    """Faults of the frames or messages sent.
 
     Attributes
     ----------
     hit : ndarray of bool, shape (n,)
-        The frame or message does not arrive as it was sent. Bytes between frames, doubles and swaps hit
-        nothing.
+        The frame or message does not arrive as sent. Bytes between frames, duplicates and swaps do not
+        count.
     kind : ndarray of uint8, shape (n,)
-        A `Kind` each.
+        `Kind` of each.
     size : ndarray of int64, shape (n,)
-        Bytes that arrive in place of the frame, or messages in place of the message.
+        Bytes that arrive for the frame, or number of messages for the message.
     """
 
     hit: NDArray[np.bool_]
@@ -75,9 +74,9 @@ class StreamFaults:
     Parameters
     ----------
     faults : Faults
-        Of the scenario; `stream`, `silences` and `unplugs` are used.
+        Faults of the scenario; `stream`, `silences` and `unplugs` are used.
     header : bytes
-        The bytes that a frame begins with, for false syncs.
+        First bytes of every frame, for false syncs.
     seed : int
         Same seed, same faults.
     """
@@ -96,7 +95,7 @@ class StreamFaults:
         )
         self._silences = faults.silences + faults.unplugs
         self._header = header
-        # what happens and how it happens are drawn apart, so that pieces of any size draw the same
+        # separate generators for kind and details: chunks of any size draw the same
         self._draw = _generator(seed, 5)
         self._rng = _generator(seed, 6)
         self._act: dict[Kind, Callable[[bytes], bytes]] = {
@@ -112,26 +111,26 @@ class StreamFaults:
         }
 
     def apply(self, frames: Bytes, t_ns: NDArray[np.int64]) -> tuple[bytes, Damage]:
-        """Send frames over the line.
+        """Apply the faults to frames.
 
         Parameters
         ----------
         frames : ndarray of uint8, shape (n, length)
-            A frame a row.
+            One frame per row.
         t_ns : ndarray of int64, shape (n,)
-            When each is sent, from the beginning of the run.
+            Time of each since the start of the run.
 
         Returns
         -------
         bytes
-            What arrives.
+            Bytes that arrive.
         Damage
-            A row a frame.
+            One row per frame.
 
         Raises
         ------
         InputError
-            Not as many times as frames, or frames too short to be damaged inside.
+            Numbers of times and frames differ, or frames are shorter than 2 bytes.
         """
         n, length = frames.shape
         if t_ns.shape != (n,) or length < 2:
@@ -145,7 +144,7 @@ class StreamFaults:
         done = 0
         for i in np.flatnonzero(kind).tolist():
             frame = frames[i].tobytes()
-            arrives = self._harm(Kind(kind[i]), frame)
+            arrives = self._damaged(Kind(kind[i]), frame)
             if arrives == frame:
                 kind[i] = Kind.NONE
             size[i] = len(arrives)
@@ -154,14 +153,14 @@ class StreamFaults:
         pieces.append(frames[done:].tobytes())
         return b"".join(pieces), _damage(kind, size)
 
-    def _harm(self, kind: Kind, frame: bytes) -> bytes:
-        """Harm a frame; it stays whole where chance would leave it readable time after time."""
+    def _damaged(self, kind: Kind, frame: bytes) -> bytes:
+        """Damage a frame; keep it whole if it stays readable after several attempts."""
         act = self._act[kind]
         if kind not in _HARM:
             return act(frame)
         for _ in range(_TRIES):
             arrives = act(frame)
-            # a frame that lost its last bytes may find the same in the next one's header
+            # lost last bytes may be equal to the header of the next frame
             if frame not in arrives + self._header[: len(frame) - 1]:
                 return arrives
         return frame
@@ -192,7 +191,7 @@ class MessageFaults:
     Parameters
     ----------
     faults : Faults
-        Of the scenario; `can`, `silences` and `unplugs` are used.
+        Faults of the scenario; `can`, `silences` and `unplugs` are used.
     seed : int
         Same seed, same faults.
     """
@@ -205,21 +204,21 @@ class MessageFaults:
         self._held = np.zeros(0, MESSAGE)
 
     def apply(self, messages: Records) -> tuple[Records, Damage]:
-        """Send messages over the bus.
+        """Apply the faults to messages.
 
         Parameters
         ----------
         messages : ndarray of MESSAGE, shape (n,)
-            With `t_ns` from the beginning of the run.
+            Messages with `t_ns` since the start of the run.
 
         Returns
         -------
         ndarray of MESSAGE
-            What arrives; messages that change places leave the times where they are. A last one that is to
-            change places with the next is held until that is fed.
+            Messages that arrive; swapped messages exchange all but their times. A last message that is to
+            be swapped with the next one is held until the next call.
         Damage
-            A row a message sent and not held. `SWAPPED` stands at the first of a pair; one before another
-            fault stays where it is.
+            One row per message sent and not held. `SWAPPED` marks the first of a pair; a message before one
+            with another fault is not swapped.
         """
         kind = _kinds(self._odds, self._silences, messages["t_ns"], self._draw)
         sent = np.concatenate([self._held, messages])
@@ -255,7 +254,7 @@ def _kinds(
     t_ns: NDArray[np.int64],
     rng: np.random.Generator,
 ) -> NDArray[np.uint8]:
-    """One kind a row: drawn, and silence where it reigns."""
+    """Return the kind of fault of each row: drawn, or silence."""
     kinds = np.array([kind for kind, _ in odds] + [Kind.NONE], np.uint8)
     edges = np.cumsum([rate for _, rate in odds])
     kind = kinds[np.searchsorted(edges, rng.random(t_ns.size), side="right")]

@@ -1,7 +1,7 @@
-"""A scenario in real time: what its wire carries goes out when it is due, onto a line that others read.
+"""Playback of a scenario in real time on a line: hardware in the loop.
 
-Paced by absolute deadlines: what is sent at `t` of the run goes out at `begin + t / speed`. Lateness never
-adds up, and what has become due meanwhile goes out at once.
+The deadlines are absolute: data sent at time `t` of the run are written at `begin + t / speed`. Delays do not
+accumulate, and overdue data are written at once.
 """
 
 import signal
@@ -27,11 +27,11 @@ from imudrv.units import NS
 from imudrv.wire.layout import Layout
 
 AHEAD: Final = 1000
-"""Samples made at a time, ahead of time: 4 ms of work, and the first of them are there soon."""
+"""Samples simulated at a time, ahead of playback; 4 ms of work, so the first are ready soon."""
 MOST: Final = 64
-"""Frames or messages that go out at a time when they are late."""
+"""Maximum number of overdue frames or messages written at a time."""
 FINEST_NS: Final = 500_000
-"""Samples closer together than this go out in groups, as a converter sends them on."""
+"""Samples closer together than this are written in groups, as a serial converter does, ns."""
 _SLICE_NS: Final = 50_000_000
 
 
@@ -41,9 +41,9 @@ class DueChunk(NamedTuple):
     Parameters
     ----------
     data : bytes or ndarray of MESSAGE
-        Empty where faults have taken all of it.
+        Data; empty if faults removed all of them.
     first_ns, last_ns : int
-        When its first and its last frame or message are sent, from the beginning of the run.
+        Time of the first and of the last frame or message since the start of the run.
     """
 
     data: bytes | Records
@@ -52,14 +52,14 @@ class DueChunk(NamedTuple):
 
 
 class PacedPlayback:
-    """What a simulated unit sends, in the order of time; made ahead in another thread, the first of it now.
+    """Output of a simulated unit in order of time, simulated ahead in another thread.
 
     Parameters
     ----------
     scenario : Scenario
-        What happens.
+        Scenario to simulate.
     layout : Layout
-        Of the profile.
+        Layout of the profile.
     """
 
     def __init__(self, scenario: Scenario, layout: Layout) -> None:
@@ -69,35 +69,35 @@ class PacedPlayback:
         self._current()
 
     def due_ns(self, group: int = 1) -> int | None:
-        """When the next frames or messages are sent.
+        """Return the time of the next frames or messages.
 
         Parameters
         ----------
         group : int
-            How many of them; fewer at the end of a piece.
+            Number of them; fewer at the end of a chunk.
 
         Returns
         -------
         int or None
-            When the last of them is sent, from the beginning of the run; None after the end.
+            Time of the last of them since the start of the run; None after the end.
         """
         chunk = self._current()
         return None if chunk is None else int(chunk.t_ns[min(self._row + group, chunk.t_ns.size) - 1])
 
     def take(self, until_ns: int, most: int = MOST) -> DueChunk | None:
-        """Take what is due.
+        """Return data that are due.
 
         Parameters
         ----------
         until_ns : int
-            From the beginning of the run.
+            Time since the start of the run.
         most : int
-            Frames or messages.
+            Maximum number of frames or messages.
 
         Returns
         -------
         DueChunk or None
-            None when nothing is due.
+            None if nothing is due.
         """
         chunk = self._current()
         if chunk is None or chunk.t_ns[self._row] > until_ns:
@@ -123,12 +123,12 @@ class PacedPlayback:
 
 
 class Pace:
-    """Time of the run against the clock, beginning now.
+    """Clock of a run that starts now.
 
     Parameters
     ----------
     speed : float or None
-        Seconds of the run in a second; None: everything is due.
+        Speed relative to real time; None: everything is due at once.
     """
 
     def __init__(self, speed: float | None) -> None:
@@ -136,19 +136,19 @@ class Pace:
         self._begin_ns = time.monotonic_ns()
 
     def now_ns(self) -> int:
-        """Time of the run."""
+        """Return the time since the start of the run."""
         if self._speed is None:
             return 2**62
         return int((time.monotonic_ns() - self._begin_ns) * self._speed)
 
     def left_ns(self, t_ns: int) -> int:
-        """How long it is until `t_ns` of the run; negative: how late it is."""
+        """Return the time left until `t_ns` of the run; negative if that has passed."""
         if self._speed is None:
             return 0
         return self._begin_ns + ceil(t_ns / self._speed) - time.monotonic_ns()
 
     def wait(self, t_ns: int, longest_s: float) -> None:
-        """Sleep until `t_ns` of the run, for `longest_s` at the most."""
+        """Sleep until `t_ns` of the run, at most for `longest_s`."""
         left_s = min(self.left_ns(t_ns) * NS, longest_s)
         if left_s > 0.0:
             time.sleep(left_s)
@@ -156,18 +156,18 @@ class Pace:
 
 @dataclass
 class Played:
-    """How a run went.
+    """Summary of a run.
 
     Parameters
     ----------
     samples : int
-        That the unit made.
+        Number of samples of the unit.
     sent, undelivered : int
-        Bytes, on CAN messages, that the line took, and that it could not take: nobody there, or too slow.
+        Bytes, on CAN messages, that were delivered, and that were not: no reader, or too slow a reader.
     unit : str
-        Which of both.
+        ``bytes`` or ``messages``.
     latest_ns : int or None
-        How late a frame went out at worst; None where there were no deadlines.
+        Largest delay of a frame; None if there were no deadlines.
     """
 
     samples: int
@@ -177,7 +177,7 @@ class Played:
     latest_ns: int | None
 
     def __str__(self) -> str:
-        """One line for people."""
+        """One-line summary."""
         late = "" if self.latest_ns is None else f"; {self.latest_ns * 1e-6:.2f} ms late at worst"
         return f"{self.samples} samples, {self.sent} {self.unit}, {self.undelivered} not delivered{late}"
 
@@ -191,28 +191,28 @@ def play(
     link: str | None = None,
     stop: threading.Event | None = None,
 ) -> Played:
-    """Play a scenario as hardware in the loop, to its end or until it is told to stop.
+    """Play a scenario as hardware in the loop, to its end or until `stop` is set.
 
-    A pty or a TCP server waits for its first reader before the run begins; from then on the unit goes on
-    whoever listens, except at `speed` None, where it waits for its reader.
+    A pty or a TCP server waits for its first reader before the run starts. After that the unit sends without
+    regard to readers, except at `speed` None, where it waits for them.
 
     Parameters
     ----------
     scenario : Scenario
-        What happens, faults included: the bytes are those of `imudrv.sim.capture.record`.
+        Scenario with its faults; the bytes are those of `imudrv.sim.capture.record`.
     profile : Profile
-        The wire format and the line's settings.
+        Wire format and settings of the line.
     target : str
         ``pty``, a serial port's path or ``serial://PATH?baudrate=N``, ``can://INTERFACE/CHANNEL?...``,
         ``tcp://[HOST]:PORT``.
     speed : float or None
-        Seconds of the run in a second; None: as fast as the reader takes it.
+        Speed relative to real time; None: as fast as the reader reads.
     say : callable
-        Told what a person wants to know, a line at a time; the last word of the first is where to listen.
+        Receives messages for the user, one line each; the first ends with the name of the port.
     link : str, optional
-        Stable name for a pty: a symbolic link, made again after an unplug.
+        Stable name for a pty: a symbolic link, renewed after an unplug.
     stop : Event, optional
-        Set it to end the run. In the main thread Ctrl-C and SIGTERM set it too.
+        Ends the run when set; in the main thread Ctrl-C and SIGTERM set it too.
 
     Returns
     -------
@@ -221,7 +221,7 @@ def play(
     Raises
     ------
     InputError
-        A target that makes no sense or cannot be opened, or a port that went away.
+        The target is not valid or cannot be opened, or the port was lost.
     """
     layout = profile.layout()
     stop = stop or threading.Event()
@@ -230,7 +230,7 @@ def play(
     with (
         _signals_set(stop),
         closing(PacedPlayback(scenario, layout)) as unit,
-        # the first samples are there before anybody hears of the line
+        # the first samples are simulated before the line is announced
         closing(open_line(target, profile, options, link)) as line,
     ):
         line.wait_for_reader()
@@ -267,12 +267,12 @@ def play(
 
 
 def speed_of(text: str) -> float | None:
-    """Read a speed: ``1``, ``0.5``, ``10``; ``max`` is None.
+    """Return the speed that a text means: ``1``, ``0.5``, ``10``; ``max`` is None.
 
     Parameters
     ----------
     text : str
-        What the user gave.
+        Text as the user gave it.
 
     Returns
     -------
@@ -281,7 +281,7 @@ def speed_of(text: str) -> float | None:
     Raises
     ------
     InputError
-        Something else.
+        The text is not a speed.
     """
     if text == "max":
         return None

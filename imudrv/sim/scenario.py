@@ -1,6 +1,6 @@
-"""The scenario file: what is simulated, checked whole before anything runs.
+"""Scenario file, checked completely before a simulation starts.
 
-Segments of the motion follow each other; each begins in the attitude the one before it left, at rest.
+Segments of the motion follow each other; each starts at rest in the attitude at the end of the previous one.
 Durations are rounded to whole sample intervals.
 """
 
@@ -31,11 +31,12 @@ Limit = Annotated[int, Key(ge=1, le=2**31 - 1)]
 
 
 class Start(Model):
-    """Where the body stands before it moves.
+    """Attitude and pivot of the body before it moves.
 
-    `z_up`: X east, Y north. `x_up`: Y east, Z north. `y_up`: Z east, X north. Then the body is turned by the
-    heading, clockwise seen from above, and its upper axis leans by `tilt_mrad` to the east and to the north.
-    The pivot is the fixed point of every rotation; the origin of b lies `pivot_offset_mm` from it, in b.
+    `z_up`: X east, Y north. `x_up`: Y east, Z north. `y_up`: Z east, X north. Then the body is rotated by the
+    heading, clockwise as viewed from above, and its upper axis is tilted by `tilt_mrad` to the east and to
+    the north. The pivot is fixed in every rotation; the origin of b is at `pivot_offset_mm` from it
+    in b.
     """
 
     pose: Literal["z_up", "x_up", "y_up"] = "z_up"
@@ -46,15 +47,15 @@ class Start(Model):
 
 
 class Rest(Model):
-    """Nothing moves."""
+    """Body at rest."""
 
     duration_s: Duration
 
 
 class Rotate(Model):
-    """A turn from rest to rest, right-handed about an axis fixed on the bench; the quintic, of least jerk.
+    """Rotation from rest to rest, right-handed about an axis fixed to the bench, with minimum jerk.
 
-    The axis is the vertical, leaning by `axis_tilt_mrad` to the east and to the north, or it is `axis_n`.
+    The axis is the vertical, tilted by `axis_tilt_mrad` to the east and to the north, or it is `axis_n`.
     """
 
     angle_deg: Annotated[float, Key(ge=-36_000, le=36_000)]
@@ -68,13 +69,13 @@ class Rotate(Model):
             raise ValueError("expected axis_tilt_mrad or axis_n, got both")
         if self.axis_n is not None and max(map(abs, self.axis_n)) < 1e-3:
             raise ValueError(
-                f"axis_n: expected a direction, with a component of 0.001 at least, got {self.axis_n}"
+                f"axis_n: expected a direction, with a component of at least 0.001, got {self.axis_n}"
             )
         return self
 
 
 class _Random(Model):
-    """Random motion in a band, faded in and out over `ramp_s`, ending at rest where it began."""
+    """Random motion in a band, faded in and out over `ramp_s`, ending at rest where it started."""
 
     duration_s: Annotated[float, Key(gt=0, le=36_000)]
     band_hz: tuple[Frequency, Frequency]
@@ -92,11 +93,11 @@ class _Random(Model):
 
 
 class Rock(_Random):
-    """Random rocking: rotations about X, then the turned Y, then the turned Z, each with its own rate.
+    """Random rocking: rotations about X, then the rotated Y, then the rotated Z, each with its own rate.
 
-    `rate_rms_deg_per_s` belongs to these three rotations between the ramps; for small angles they are the
-    body's rates. One that would beat `rate_peak_deg_per_s` at the end of a sample is made smaller as a whole.
-    `sway_mm` is the rms way of the pivot east, north and up, for a unit carried by hand.
+    `rate_rms_deg_per_s` applies to these three rotations between the ramps; for small angles they are the
+    body rates. A rotation whose rate exceeds `rate_peak_deg_per_s` at the end of a sample is scaled down.
+    `sway_mm` is the rms displacement of the pivot east, north and up, for a unit carried by hand.
     """
 
     rate_rms_deg_per_s: tuple[Rate, Rate, Rate]
@@ -105,14 +106,14 @@ class Rock(_Random):
 
 
 class Vibrate(_Random):
-    """Random vibration of the pivot, `g_rms` east, north and up, and what the bench answers in rotation."""
+    """Random vibration of the pivot, `g_rms` east, north and up, with the rotation that the bench adds."""
 
     g_rms: tuple[Rate, Rate, Rate]
     rate_rms_deg_per_s: tuple[Rate, Rate, Rate] = (0.0, 0.0, 0.0)
 
 
 class Segment(Model):
-    """One entry of the motion: exactly one of its keys."""
+    """One entry of the motion, with exactly one key."""
 
     rest: Rest | None = None
     rotate: Rotate | None = None
@@ -130,14 +131,14 @@ class Segment(Model):
 
     @property
     def motion(self) -> Rest | Rotate | Rock | Vibrate:
-        """The one that is given."""
-        motion = self.rest or self.rotate or self.rock or self.vibrate
-        assert motion is not None
-        return motion
+        """The motion of the one key."""
+        motions: tuple[Rest | Rotate | Rock | Vibrate | None, ...]
+        motions = self.rest, self.rotate, self.rock, self.vibrate
+        return next(motion for motion in motions if motion is not None)
 
 
 class Residuals(Model):
-    """1-sigma of what the unit differs by from its calibration, drawn once for each axis."""
+    """1-sigma differences between the unit and its calibration, drawn once for each axis."""
 
     gyro_bias_deg_per_h: Amount = 0.0
     gyro_scale_ppm: Amount = 0.0
@@ -148,17 +149,17 @@ class Residuals(Model):
 
 
 class Noise(Model):
-    """White noise of the sensors: random walk of angle and velocity."""
+    """White noise of the sensors: angle and velocity random walk."""
 
     arw_deg_per_sqrt_h: Amount = 0.0
     vrw_m_s_per_sqrt_h: Amount = 0.0
 
 
 class Dither(Model):
-    """The gyro blocks' dither: `amplitude_arcsec * sin`, about each gyro's own axis, phases random.
+    """Dither of the gyro blocks: `amplitude_arcsec * sin` about the axis of each gyro, with random phases.
 
-    `in_increments` is the fraction that the gyro increments still carry; `case_reaction` the fraction by
-    which the whole body turns.
+    `in_increments` is the fraction left in the gyro increments; `case_reaction` the fraction by which the
+    whole body rotates.
     """
 
     amplitude_arcsec: tuple[Rate, Rate, Rate]
@@ -168,7 +169,7 @@ class Dither(Model):
 
 
 class Temperature(Model):
-    """Course of the temperature, one for all channels: a slope, and an approach to `settles_at_degc`."""
+    """Temperature of all channels: a slope, and an exponential approach to `settles_at_degc`."""
 
     start_degc: Celsius = 35.0
     slope_k_per_h: Annotated[float, Key(ge=-1000, le=1000)] = 0.0
@@ -183,18 +184,17 @@ class Temperature(Model):
 
 
 class Saturation(Model):
-    """Most pulses that an axis can count in one sample interval; what is beyond is lost."""
+    """Maximum number of pulses of an axis in one sample interval; further pulses are lost."""
 
     gyro_pulses: Limit = 2**31 - 1
     accelerometer_pulses: Limit = 2**31 - 1
 
 
 class Unit(Model):
-    """The unit: its calibration (a file, or inline, or else that of the nominal unit) and what spoils it.
+    """Unit: its calibration (a file, or inline, by default that of the nominal unit) and its errors.
 
-    The file is looked for beside the scenario. Residuals make the unit differ from its calibration.
-
-    The accelerometers' sample ends `accelerometer_skew_s` later than the gyros'.
+    The path of the file is relative to the scenario. Residuals make the unit differ from its calibration.
+    The sample interval of the accelerometers ends `accelerometer_skew_s` later than that of the gyros.
     """
 
     calibration_file: Annotated[str, Key(min_length=1, max_length=4096)] | None = None
@@ -215,25 +215,25 @@ class Unit(Model):
 
 
 class Silence(Model):
-    """A span in which nothing is sent."""
+    """Time in which nothing is sent."""
 
     at_s: Annotated[float, Key(ge=0, le=1e7)]
     duration_s: Duration
 
 
 class Unplug(Silence):
-    """The cable is out: a silence; played live the port goes away and comes back."""
+    """Unplugged cable: a silence; in real time the port disappears and comes back."""
 
 
 class CounterJump(Model):
-    """From the first sample that ends after `at_s` the counter is further by `by`; backwards is a restart."""
+    """Jump of the counter by `by` at the first sample that ends after `at_s`; a jump back is a restart."""
 
     at_s: Annotated[float, Key(ge=0, le=1e7)]
     by: Annotated[int, Key(ge=-(2**32), le=2**32)]
 
 
 class StreamRates(Model):
-    """Probability per frame of a serial line's faults; a frame suffers one at the most."""
+    """Probabilities of the faults of a serial line per frame; a frame has at most one fault."""
 
     bit_flips: Fraction = 0.0
     bytes_lost: Fraction = 0.0
@@ -251,7 +251,7 @@ class StreamRates(Model):
 
 
 class MessageRates(Model):
-    """Probability per message of a CAN bus' faults; a message suffers one at the most."""
+    """Probabilities of the faults of a CAN bus per message; a message has at most one fault."""
 
     lost: Fraction = 0.0
     doubled: Fraction = 0.0
@@ -266,11 +266,11 @@ class MessageRates(Model):
 def _at_most_one(rates: StreamRates | MessageRates) -> None:
     total = sum(rates.model_dump().values())
     if total > 1.0:
-        raise ValueError(f"expected probabilities that add up to 1 at most, got {total:g}")
+        raise ValueError(f"expected probabilities with a sum of at most 1, got {total:g}")
 
 
 class Faults(Model):
-    """What goes wrong on the way."""
+    """Faults of the line and of the counter."""
 
     stream: StreamRates = StreamRates()
     can: MessageRates = MessageRates()
@@ -284,13 +284,13 @@ class Faults(Model):
             if before.at_s + before.duration_s >= after.at_s:
                 raise ValueError(
                     f"unplugs: expected one after the other, got one at {after.at_s:g} s "
-                    f"before that of {before.at_s:g} s is over"
+                    f"before the end of that at {before.at_s:g} s"
                 )
         return self
 
 
 class Scenario(Model):
-    """A scenario file."""
+    """Scenario file."""
 
     format: Literal["imu50-scenario"]
     version: Literal[1]
@@ -326,11 +326,11 @@ NOMINAL = parse(
     Calibration,
     "nominal unit",
 )
-"""The unit where the scenario gives none: nominal scales, no errors, arms of some 30 mm."""
+"""Calibration of a scenario without one: nominal scales, no errors, lever arms of about 30 mm."""
 
 
 def shipped() -> list[str]:
-    """Names of the scenarios that come with the package."""
+    """Return the names of the scenarios that come with the package."""
     return sorted(
         p.name.removesuffix(".yaml") for p in (resources.files(__package__) / "scenarios").iterdir()
     )
@@ -347,12 +347,12 @@ def load(name_or_path: str) -> Scenario:
     Returns
     -------
     Scenario
-        Checked; a calibration file has become `unit.calibration`.
+        Checked scenario, with the content of a calibration file in `unit.calibration`.
 
     Raises
     ------
     InputError
-        No such scenario, or one with faults, or its calibration file has them.
+        The scenario does not exist, or it or its calibration file is not valid.
     """
     if name_or_path in shipped():
         with resources.as_file(resources.files(__package__) / "scenarios" / f"{name_or_path}.yaml") as path:
@@ -366,7 +366,7 @@ def load(name_or_path: str) -> Scenario:
 
 
 def files(name_or_path: str) -> tuple[Path, ...]:
-    """Files that a scenario comes from, that of its calibration included; none for a shipped one."""
+    """Return the files of a scenario, calibration included; none for a shipped one."""
     path = Path(name_or_path)
     if name_or_path in shipped():
         return ()
@@ -384,7 +384,7 @@ def _read(path: Path) -> Scenario:
 
 
 def samples(scenario: Scenario, interval_ns: int) -> int:
-    """How many samples a scenario has; each segment is rounded to whole intervals.
+    """Return the number of samples of a scenario; each segment is rounded to whole intervals.
 
     Parameters
     ----------
@@ -401,5 +401,5 @@ def samples(scenario: Scenario, interval_ns: int) -> int:
 
 
 def intervals(duration_s: float, interval_s: float) -> int:
-    """Sample intervals of a segment: a whole number, at least one."""
+    """Return the number of sample intervals of a segment, at least one."""
     return max(1, round(duration_s / interval_s))

@@ -1,13 +1,13 @@
-"""The unit: true integrals of motion to pulses, with the unit's own errors, and the truth beside them.
+"""Simulated unit: true integrals of motion to pulses, with the errors of the unit, and the truth.
 
-The true unit is a calibration (its file's conventions, taken backwards) that differs by drawn residuals from
-the one that will compensate it:
+The true unit is a calibration, with the conventions of the file inverted, that differs by drawn residuals
+from the one that will compensate it:
 
     gyro axes            N_g = C_bg^-1 (dtheta_b + b_g tau) / k_g
     accelerometer i      N_i = K_i (integral of f_i + b_i tau)
 
 with `k_g`, `K`, `b_g`, `b` each at the temperature of the sample: the scale in the file times
-`1 + ppm_per_k (T - T_reference)`, the bias plus `bias_per_k (T - T_reference)`. Pulses are whole; their
+`1 + ppm_per_k (T - T_reference)`, the bias plus `bias_per_k (T - T_reference)`. Pulses are integers; the
 fraction is carried into the next sample.
 """
 
@@ -30,16 +30,16 @@ from imudrv.units import ARCSEC, DEG_PER_H, DEG_PER_SQRT_H, MM, NS, PPM, UG, URA
 from imudrv.vectors import Vector, dot, row
 
 PER_SQRT_H: Final = 1.0 / 60.0
-"""One per square root of an hour, 1/sqrt(s)."""
+"""1/sqrt(h) in 1/sqrt(s)."""
 STATUS_WARM_UP: Final = 1 << 0
-"""Status bit: the unit has not run long enough (ICD, section 2)."""
+"""Status bit: warm-up (ICD, section 2)."""
 STATUS_OVERFLOW: Final = 1 << 10
-"""Status bit: an axis had more pulses than it can count (ICD, section 2)."""
+"""Status bit: pulse overflow of an axis (ICD, section 2)."""
 
 TRUTH: Final = np.dtype(
     [
         ("counter", np.int64),
-        ("t_s", np.float64),  # end of the interval, from the beginning of the run
+        ("t_s", np.float64),  # end of the interval, since the start of the run
         ("dtheta_b", np.float64, 3),  # integral of omega_ib_b, rad
         ("dv_b", np.float64, 3),  # integral of the specific force at the origin of b, m/s
         ("omega_ib_b", np.float64, 3),  # at the end, rad/s
@@ -47,20 +47,19 @@ TRUTH: Final = np.dtype(
     ],
     align=True,
 )
-"""What really happened in one sample interval."""
+"""Truth of one sample interval."""
 
 
 @dataclass(frozen=True)
 class Chunk:
-    """A stretch of samples.
+    """Consecutive samples.
 
     Attributes
     ----------
     pulses : ndarray of PULSES
-        Times count from the beginning of the run. Flags are zero: they belong to the stage that keeps account
-        of samples.
+        Pulses, with times since the start of the run. Flags are zero: sequence tracking sets them.
     truth : ndarray of TRUTH
-        Row by row the same samples.
+        Truth of the same samples.
     """
 
     pulses: Records
@@ -69,7 +68,7 @@ class Chunk:
 
 @dataclass(frozen=True)
 class TrueUnit:
-    """The unit as it really is, SI, the last axis that of the sensor or, for matrices, of the file."""
+    """True parameters of a unit, in SI units; arrays are by sensor axis, matrices as in the file."""
 
     gyro_scale: Array  # rad per pulse
     gyro_bias: Array  # rad/s, on body axes
@@ -86,7 +85,7 @@ class TrueUnit:
 
 
 class _Electronics(NamedTuple):
-    """From integrals to pulses, as the kernel takes it; gyro quantities are on the gyros' own axes."""
+    """Parameters of the kernel, from integrals to pulses; gyro quantities are on the axes of the gyros."""
 
     interval_s: float
     G: Array  # C_bg^-1
@@ -96,7 +95,7 @@ class _Electronics(NamedTuple):
     gyro_scale_per_k: Array
     gyro_noise: float  # 1 sigma of an increment, rad
     gyro_limit: float
-    dither: Dithering  # left in the gyro increments
+    dither: Dithering  # part in the gyro increments
     accelerometer_scale: Array
     accelerometer_bias: Array
     accelerometer_bias_per_k: Array
@@ -111,12 +110,12 @@ class _Electronics(NamedTuple):
 
 
 def draw_true_unit(scenario: Scenario) -> TrueUnit:
-    """Draw the true unit: the scenario's calibration and residuals, by the scenario's seed.
+    """Draw the true unit from the calibration, the residuals and the seed of a scenario.
 
     Parameters
     ----------
     scenario : Scenario
-        `unit` and `seed` are used; the seed alone decides the shape of the residuals, their 1-sigma the size.
+        `unit` and `seed` are used; the seed gives the normalised residuals, scaled by their 1-sigma.
 
     Returns
     -------
@@ -148,35 +147,35 @@ def draw_true_unit(scenario: Scenario) -> TrueUnit:
 
 
 def simulate(scenario: Scenario, interval_ns: int, chunk: int = 65_536) -> Iterator[Chunk]:
-    """Run a scenario.
+    """Simulate a scenario.
 
     Parameters
     ----------
     scenario : Scenario
-        What is simulated; `faults` matter only by their counter jumps, the rest happens on the wire.
+        Scenario; of `faults` only the counter jumps apply here, the others act on the wire.
     interval_ns : int
         Sample interval; durations of the motion are rounded to whole intervals.
     chunk : int
-        Samples at a time. Any value gives the same bits.
+        Number of samples at a time; any value gives the same bits.
 
     Yields
     ------
     Chunk
-        Up to `chunk` samples; memory stays that of one chunk.
+        Up to `chunk` samples.
 
     Raises
     ------
     InputError
-        An interval or chunk that makes no sense.
+        The interval or the chunk is out of range.
     """
     if not 10_000 <= interval_ns <= 1_000_000_000:
         raise InputError(f"simulation: expected a sample interval of 10 us to 1 s, got {interval_ns} ns")
     if chunk < 1:
-        raise InputError(f"simulation: expected chunks of one sample at least, got {chunk}")
+        raise InputError(f"simulation: expected chunks of at least one sample, got {chunk}")
     interval_s = interval_ns * NS
     truth = draw_true_unit(scenario)
     rng = _generator(scenario, 3)
-    # Skewed, an accelerometer's sample is the late part of one interval and the early part of a later one.
+    # With a skew, an accelerometer sample is the late part of one interval and the early part of a later one.
     skew, split_ns = divmod(round(scenario.unit.accelerometer_skew_s / NS), interval_ns)
     motion = Motion(scenario, _body(scenario, truth, interval_s), interval_ns, split_ns * NS)
     electronics = _electronics(scenario, truth, interval_s)
@@ -184,10 +183,10 @@ def simulate(scenario: Scenario, interval_ns: int, chunk: int = 65_536) -> Itera
     for first in range(0, motion.samples, chunk):
         n = min(chunk, motion.samples - first)
         begin = min(0, skew)
-        there = motion.integrals(first + begin, first + n + max(0, skew + 1))
-        own = Integrals(*(a[-begin : n - begin] for a in there))
+        around = motion.integrals(first + begin, first + n + max(0, skew + 1))
+        own = Integrals(*(a[-begin : n - begin] for a in around))
         later = skew - begin
-        velocity = there.late[later : later + n] + there.early[later + 1 : later + 1 + n]
+        velocity = around.late[later : later + n] + around.early[later + 1 : later + 1 + n]
         pulses = np.zeros(n, PULSES)
         counter = scenario.start.counter + np.arange(first, first + n)
         t_ns = (np.arange(first, first + n) + 1) * interval_ns
@@ -207,14 +206,14 @@ def simulate(scenario: Scenario, interval_ns: int, chunk: int = 65_536) -> Itera
 
 
 def jumped(faults: Faults, t_ns: np.ndarray) -> np.ndarray:
-    """How far the counter has jumped.
+    """Return the sum of the counter jumps up to each sample.
 
     Parameters
     ----------
     faults : Faults
-        Their `counter_jumps`.
+        Only `counter_jumps` is used.
     t_ns : ndarray of int, shape (n,)
-        Ends of the samples, from the beginning of the run.
+        End of each sample since the start of the run.
 
     Returns
     -------
@@ -318,16 +317,16 @@ def _count(
     degc: Array,
     overflow: np.ndarray,
 ) -> None:
-    """Count the run's samples from `first`, shape (n, 6); `carry` is each axis' fraction of a pulse."""
+    """Fill `counts` (n, 6) from sample `first` on; `carry` (6,) is the fraction of a pulse of each axis."""
     tau = unit.interval_s
-    before = _left(unit.dither, first)
+    before = _dither_angle(unit.dither, first)
     for i in range(dtheta_b.shape[0]):
         t = (first + i + 1) * tau
         degc[i] = (
             unit.start_degc + unit.slope_k_per_s * t + unit.rise_k * (1.0 - exp(-t / unit.time_constant_s))
         )
         warmer = degc[i] - unit.reference_degc
-        left = _left(unit.dither, first + i + 1)
+        angle_now = _dither_angle(unit.dither, first + i + 1)
         angle_b = (
             dtheta_b[i, 0] + tau * (unit.gyro_bias[0] + warmer * unit.gyro_bias_per_k[0]),
             dtheta_b[i, 1] + tau * (unit.gyro_bias[1] + warmer * unit.gyro_bias_per_k[1]),
@@ -335,7 +334,7 @@ def _count(
         )
         overflow[i] = False
         for m in range(3):
-            angle = dot(row(unit.G, m), angle_b) + left[m] - before[m] + unit.gyro_noise * noise[i, m]
+            angle = dot(row(unit.G, m), angle_b) + angle_now[m] - before[m] + unit.gyro_noise * noise[i, m]
             scale = unit.gyro_scale[m] * (1.0 + warmer * unit.gyro_scale_per_k[m])
             pulses = _quantise(angle / scale, carry, m)
             counts[i, m] = min(max(pulses, -unit.gyro_limit), unit.gyro_limit)
@@ -347,12 +346,12 @@ def _count(
             pulses = _quantise(speed * scale, carry, 3 + m)
             counts[i, 3 + m] = min(max(pulses, -unit.accelerometer_limit), unit.accelerometer_limit)
             overflow[i] |= abs(pulses) > unit.accelerometer_limit
-        before = left
+        before = angle_now
 
 
 @kernel
-def _left(dither: Dithering, interval: int) -> Vector:
-    """Dither's angle that the gyros see at the beginning of an interval."""
+def _dither_angle(dither: Dithering, interval: int) -> Vector:
+    """Return the dither angle in the gyro increments at the start of an interval."""
     a = dither.amplitude_rad
     return (
         a[0] * sin(2.0 * pi * (cycles_at(dither.cycles[0], interval) + dither.phase[0])),

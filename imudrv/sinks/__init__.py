@@ -1,9 +1,9 @@
-"""Out: where pulses and increments go; each way by its URL.
+"""Outputs of pulses and increments, opened by URL.
 
-base      what every sink keeps to      backlog   datagrams that wait for a consumer
-network   UDP, TCP      serial, can     ports and buses      file    a growing file
-recorder  everything, into an MCAP      spool     the thread that writes a file
-files     tables of a whole capture
+base      interface of a sink           backlog   queue of datagrams for one consumer
+network   UDP, TCP                      serial    serial line
+can       CAN bus                       file      growing file
+recorder  MCAP recording                history   the latest reads, in memory
 """
 
 from imudrv.errors import InputError
@@ -14,7 +14,7 @@ SCHEMES = ("udp", "tcp", "serial", "can", "file")
 
 
 def open_sink(url: str, layout: Layout) -> Sink:
-    """Open a way out.
+    """Open a sink.
 
     Parameters
     ----------
@@ -22,20 +22,19 @@ def open_sink(url: str, layout: Layout) -> Sink:
         ``udp://HOST:PORT``, ``tcp://HOST:PORT``, ``serial://PATH?baudrate=...``,
         ``can://INTERFACE/CHANNEL?profile=...`` or ``file:NAME.i50n``.
     layout : Layout
-        Of the unit.
+        Layout of the unit.
 
     Returns
     -------
     Sink
-        Open, or on its way there: what is absent now may come later.
+        The sink; an absent device or receiver may still appear later.
 
     Raises
     ------
     InputError
-        What no waiting will mend: a URL of no known kind, a setting that does not exist, an address or name
-        that cannot be had.
+        Faults that a retry does not fix: unknown scheme or setting, address or name that cannot be used.
     """
-    # Only what is used is loaded: python-can alone would double the time that a command takes to start.
+    # Import only what is used: python-can alone would double the start-up time of a command.
     scheme = url.partition(":")[0]
     if scheme == "udp":
         from imudrv.sinks.network import UdpSink
@@ -57,4 +56,4 @@ def open_sink(url: str, layout: Layout) -> Sink:
         from imudrv.sinks.file import FileSink
 
         return FileSink(url)
-    raise InputError(f"{url}: expected {', '.join(f'{s}:' for s in SCHEMES)} in front, got {scheme!r}")
+    raise InputError(f"{url}: expected {', '.join(f'{s}:' for s in SCHEMES)} at the start, got {scheme!r}")

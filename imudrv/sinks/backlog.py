@@ -1,4 +1,4 @@
-"""Datagrams that wait for a byte consumer: bounded, the oldest go first, none is ever torn."""
+"""Bounded queue of datagrams for a byte consumer; the oldest are dropped, always whole."""
 
 from collections.abc import Callable
 from typing import Final
@@ -6,44 +6,44 @@ from typing import Final
 from imudrv.wire.datagram import SIZE
 
 LIMIT: Final = 4096
-"""Samples that wait at the most: 4 s at 1 kHz, 0.2 s at 20 kHz."""
+"""Maximum number of queued samples: 4 s at 1 kHz, 0.2 s at 20 kHz."""
 
 
 class Backlog:
-    """The way of datagrams to one consumer, with its books: put = `sent` + `dropped` + `queued`.
+    """Queue of datagrams to one consumer; put = `sent` + `dropped` + `queued`.
 
     Parameters
     ----------
     piece : int
-        Samples written at a time at the most.
+        Maximum number of samples written at a time.
     """
 
     def __init__(self, piece: int) -> None:
         self.sent = 0
         self.dropped = 0
         self._piece = piece * SIZE
-        self._begun = b""  # what is left of a datagram whose first bytes are out
+        self._begun = b""  # rest of a datagram whose first bytes were written
         self._whole = bytearray()
 
     @property
     def queued(self) -> int:
-        """Samples that wait, one that is partly out included."""
+        """Number of queued samples, one that is partly written included."""
         return len(self._whole) // SIZE + bool(self._begun)
 
     def put(self, datagrams: bytes, write: Callable[[bytes], int]) -> None:
-        """Take datagrams, write what the consumer takes, and drop the oldest of what is too much.
+        """Append datagrams, write as many as possible, and drop the oldest above the limit.
 
         Parameters
         ----------
         datagrams : bytes
-            Whole ones.
+            Whole datagrams.
         write : callable
             As for `flush`.
 
         Raises
         ------
         OSError
-            Of `write`; the datagrams wait.
+            Raised by `write`; the datagrams stay queued.
         """
         self._whole += datagrams
         try:
@@ -55,17 +55,17 @@ class Backlog:
                 self.dropped += excess // SIZE
 
     def flush(self, write: Callable[[bytes], int]) -> None:
-        """Write what waits, as far as the consumer takes it.
+        """Write queued datagrams until the consumer blocks.
 
         Parameters
         ----------
         write : callable
-            Takes bytes and tells how many of them went out; raises `BlockingIOError` when none can now.
+            Writes bytes and returns how many were written; raises `BlockingIOError` if none can be.
 
         Raises
         ------
         OSError
-            Of `write`; what waits goes on waiting.
+            Raised by `write`; the datagrams stay queued.
         """
         while piece := self._begun or bytes(self._whole[: self._piece]):
             try:
@@ -84,7 +84,7 @@ class Backlog:
                 return
 
     def abandon(self) -> None:
-        """Drop all that waits: the consumer has gone."""
+        """Drop everything queued, as the consumer has disconnected."""
         self.dropped += self.queued
         self._begun = b""
         self._whole.clear()

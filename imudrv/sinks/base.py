@@ -7,18 +7,18 @@ from imudrv.records import Records
 
 
 class Batch(NamedTuple):
-    """What the loop hands on at a time: one sample, or all that came after a stall.
+    """Samples published together: one, or several after a stall.
 
-    Nothing in it changes afterwards: a sink may keep it.
+    A batch never changes afterwards: a sink may keep it.
 
     Parameters
     ----------
     pulses : ndarray of PULSES
-        Accounted for; with a rate filter that lags, newer than the increments.
+        Pulses; with a rate filter that has a delay, newer than the increments.
     increments : ndarray of INCREMENTS
-        Compensated.
+        Compensated increments.
     datagrams : bytes
-        The same increments as `I50N` datagrams.
+        The increments as `I50N` datagrams.
     """
 
     pulses: Records
@@ -27,21 +27,21 @@ class Batch(NamedTuple):
 
 
 class SinkState(NamedTuple):
-    """How a sink is.
+    """State of a sink.
 
     Parameters
     ----------
     url : str
-        As the user gave it.
+        URL as the user gave it.
     state : str
         One or a few words: ``ok``, ``waiting for a client``, ``2 clients``, ``disk full``.
     healthy : bool
-        Nothing needs a person.
+        Whether no action of the user is needed.
     sent, dropped : int
-        Samples handed over, and given up since the queue was full or the consumer gone; a sample that goes to
-        several clients counts once for each.
+        Samples delivered, and samples dropped because the queue was full or the consumer absent; for several
+        clients a sample counts once for each.
     queued : int
-        Samples that wait now.
+        Samples in the queue.
     """
 
     url: str
@@ -53,17 +53,17 @@ class SinkState(NamedTuple):
 
 
 class Sink(ABC):
-    """A way out.
+    """Output for samples.
 
-    `publish` and `poll` are called by the live loop and never block: what cannot go out at once waits in a
-    bounded queue of the sink's own, whose oldest samples are dropped and counted when it is full. The queue
-    is for a consumer that stalls; one that is absent gets what comes once it is there. Neither raises for a
-    consumer's fault; the state tells it.
+    `publish` and `poll` are called by the live loop and never block: what cannot be sent at once waits in a
+    bounded queue, whose oldest samples are dropped and counted when it is full. The queue is for a consumer
+    that stalls; an absent one receives the samples published after it appears. Neither method raises for a
+    fault of the consumer; `state` reports it.
 
     Parameters
     ----------
     url : str
-        As the user gave it.
+        URL as the user gave it.
     """
 
     def __init__(self, url: str) -> None:
@@ -71,17 +71,17 @@ class Sink(ABC):
 
     @abstractmethod
     def publish(self, batch: Batch) -> None:
-        """Hand a batch on."""
+        """Send a batch."""
 
     def poll(self) -> None:
-        """Housekeeping, at least twenty times a second: new clients, what waits, what to open again."""
+        """Accept clients, send what is queued, reopen devices; called at least twenty times a second."""
         return
 
     @property
     @abstractmethod
     def state(self) -> SinkState:
-        """How it is now."""
+        """Current state."""
 
     @abstractmethod
     def close(self) -> None:
-        """Send what waits, for a second at the most, and let go."""
+        """Send what is queued for at most a second, and close."""

@@ -1,4 +1,4 @@
-"""Pulses out again on a CAN bus, in any CAN profile: a gateway."""
+"""Gateway: pulses to a CAN bus, in any CAN profile."""
 
 import time
 from contextlib import closing, suppress
@@ -12,7 +12,7 @@ import numpy as np
 from imudrv import profiles
 from imudrv.errors import InputError
 from imudrv.ports.base import PortLostError
-from imudrv.ports.can import CanPort, prepare
+from imudrv.ports.can import prepare
 from imudrv.ports.url import split
 from imudrv.records import PULSES, Records
 from imudrv.sinks.base import Batch, Sink, SinkState
@@ -20,31 +20,31 @@ from imudrv.wire.encode import CanEncoder
 from imudrv.wire.layout import Layout
 
 LIMIT: Final = 4096
-"""Samples that wait at the most."""
+"""Maximum number of queued samples."""
 _RETRY_S: Final = 1.0
 _SEND_S: Final = 0.1
-_LAST_SECOND_S: Final = 1.0
+_CLOSE_S: Final = 1.0
 
 
 class CanSink(Sink):
     """Gateway to a CAN bus.
 
-    What the profile cannot say is dropped and counted: a sample whose pulses its fields cannot hold, and one
-    that covers several intervals unless the profile has running totals. Temperatures go by what they
-    measure; one that the unit does not have goes out as zero counts. Drivers may block, hence a thread sends.
+    Samples that the profile cannot represent are dropped and counted: those whose pulses exceed a field, and
+    those of several intervals unless the profile has running totals. Temperatures are matched by sensor; one
+    that the unit does not have is sent as zero counts. Drivers may block, hence a thread sends.
 
     Parameters
     ----------
     url : str
-        ``can://INTERFACE/CHANNEL?profile=imu50-can``; what else stands behind the ``?`` goes to python-can,
-        bit rates come from the profile unless given.
+        ``can://INTERFACE/CHANNEL?profile=imu50-can``; other options go to python-can, and bit rates come
+        from the profile unless given.
     layout : Layout
-        Of the unit.
+        Layout of the unit.
 
     Raises
     ------
     InputError
-        No such interface or profile, or one with another sample rate than the unit's.
+        Unknown interface or profile, or a profile with another sample rate than that of the unit.
     """
 
     def __init__(self, url: str, layout: Layout) -> None:
@@ -57,11 +57,11 @@ class CanSink(Sink):
         self._layout = profile.layout()
         if self._layout.interval_ns != layout.interval_ns:
             raise InputError(
-                f"{url}: expected a profile of the unit's {1e9 / layout.interval_ns:g} samples a second, "
-                f"got {profile.name} with {profile.sample_rate_hz:g}; take another profile"
+                f"{url}: expected a profile of {1e9 / layout.interval_ns:g} samples/s like the unit, "
+                f"got {profile.name} with {profile.sample_rate_hz:g}; choose another profile"
             )
         self._temperatures = _related(layout.temperature_names, self._layout.temperature_names)
-        CanEncoder(self._layout).encode(np.zeros(1, PULSES))  # compiled before samples come
+        CanEncoder(self._layout).encode(np.zeros(1, PULSES))  # compile before samples arrive
         self._encoder = CanEncoder(self._layout)
         self._queue: SimpleQueue[Records | None] = SimpleQueue()
         self._put = self._evicted = 0  # counted by the loop
@@ -72,7 +72,7 @@ class CanSink(Sink):
         self._thread.start()
 
     def publish(self, batch: Batch) -> None:
-        """Hand a batch on."""
+        """Send a batch."""
         self._put += batch.pulses.size
         self._queue.put(batch.pulses)
         with suppress(Empty):
@@ -82,17 +82,17 @@ class CanSink(Sink):
 
     @property
     def state(self) -> SinkState:
-        """How it is now."""
+        """Current state."""
         words = self._trouble or "ok"
         dropped = self._evicted + self._given_up
         return SinkState(self.url, words, not self._trouble, self._sent, dropped, self._queued)
 
     def close(self) -> None:
-        """Send what waits, for a second at the most, and let go."""
+        """Send what is queued for at most a second, and close."""
         self._queue.put(None)
-        self._thread.join(_LAST_SECOND_S)
+        self._thread.join(_CLOSE_S)
         self._is_closing = True
-        self._thread.join(_LAST_SECOND_S)
+        self._thread.join(_CLOSE_S)
         self._evicted += self._queued
 
     @property
@@ -103,9 +103,7 @@ class CanSink(Sink):
         is_on = True
         while is_on and not self._is_closing:
             try:
-                port = self._open()
-                assert isinstance(port, CanPort)
-                with closing(port):
+                with closing(self._open()) as port:
                     self._trouble = ""
                     self._serve(port.bus)
                     return
@@ -130,7 +128,7 @@ class CanSink(Sink):
                 raise
 
     def _idle(self, seconds: float) -> bool:
-        """Let samples go by while there is no bus; whether the queue goes on."""
+        """Drop samples while there is no bus; return whether the queue continues."""
         until = time.monotonic() + seconds
         with suppress(Empty):
             while (left := until - time.monotonic()) > 0:
@@ -141,7 +139,7 @@ class CanSink(Sink):
         return True
 
     def _send(self, bus: can.BusABC, pulses: Records) -> bool:
-        """Send one sample; whether the profile can say it."""
+        """Send one sample; return whether the profile can represent it."""
         if pulses["interval_ns"][0] != self._layout.interval_ns and not self._layout.totals:
             return False
         try:
@@ -172,7 +170,7 @@ class CanSink(Sink):
 
 
 def _related(have: tuple[str, ...], want: tuple[str, ...]) -> list[list[int]]:
-    """For each wanted sensor the channels that measure it: ``accelerometer`` is the mean of all three."""
+    """Return the channels that measure each wanted sensor; ``accelerometer`` is measured by all three."""
     return [
         [k for k, name in enumerate(have) if name.startswith(sensor) or sensor.startswith(name)]
         for sensor in want

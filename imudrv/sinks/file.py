@@ -1,4 +1,4 @@
-"""Increments into a file as they come: datagrams or rows of text."""
+"""Increments to a growing file, as datagrams or rows of text."""
 
 from collections import deque
 from contextlib import suppress
@@ -15,12 +15,12 @@ from imudrv.records import Records
 from imudrv.sinks.base import Batch, Sink, SinkState
 
 LIMIT: Final = 16_384
-"""Samples that wait at the most."""
+"""Maximum number of queued samples."""
 _PIECE: Final = 512
 
 
 class FileSink(Sink):
-    """A new file that is whole up to 0.25 s ago at every moment.
+    """New file, complete up to 0.25 s ago at any time.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ class FileSink(Sink):
     Raises
     ------
     InputError
-        Another suffix, a file that exists, or a folder that cannot be written to.
+        Another suffix, an existing file, or a folder that cannot be written to.
     """
 
     def __init__(self, url: str) -> None:
@@ -39,7 +39,7 @@ class FileSink(Sink):
         if path.suffix not in (".i50n", ".csv"):
             raise InputError(
                 f"{url}: expected file:NAME.i50n or file:NAME.csv, got {path.suffix or 'no suffix'}; "
-                "for other kinds record the run and export the recording"
+                "for other formats record the run and export the recording"
             )
         self._queue: deque[Batch] = deque()
         self._put = self._dropped = 0
@@ -48,25 +48,25 @@ class FileSink(Sink):
         self._spool = AppendThread(path, b"", self._next_piece)
 
     def publish(self, batch: Batch) -> None:
-        """Hand a batch on."""
+        """Send a batch."""
         self._put += batch.increments.size
         self._queue.append(batch)
         while self._queued > LIMIT:
             try:
                 self._dropped += self._queue.popleft().increments.size
-            except IndexError:  # the thread has all of it in hand
+            except IndexError:  # the thread has taken all of it
                 return
 
     @property
     def state(self) -> SinkState:
-        """How it is now."""
+        """Current state."""
         trouble = self._spool.trouble
         return SinkState(
             self.url, trouble or "ok", not trouble, self._spool.sent, self._dropped, self._queued
         )
 
     def close(self) -> None:
-        """Write what waits, for some seconds at the most, and let go."""
+        """Write what is queued for at most some seconds, and close the file."""
         self._spool.close()
         self._dropped += self._queued
 

@@ -1,7 +1,7 @@
-"""The last minutes of the line in memory, so that a recording can begin at a sample that is already past.
+"""The last minutes of reads in memory, so that a recording can start at a sample in the past.
 
-Whoever asks for a recording may be late: the thread was held up by a slow disk, the machine is loaded. With
-the history it names the sample to begin with, and the reads that brought that sample are still there.
+The request for a recording may be late, because of a slow disk or a loaded machine. It names the first
+sample, and the history still has the reads that contain it.
 """
 
 from collections import deque
@@ -11,23 +11,23 @@ from imudrv.records import Arrival
 from imudrv.sinks.base import Batch
 
 MAX_BYTES: Final = 64 << 20
-"""Most memory that a history takes: at 1 kHz 150 s of a serial line, 80 s of a CAN bus, read one by one."""
+"""Maximum memory of a history: at 1 kHz 150 s of a serial line, 80 s of a CAN bus, one sample per read."""
 _OBJECT_BYTES: Final = 300
-"""Python's own part of a read and its batch."""
+"""Overhead of Python for a read and its batch."""
 _LEAD: Final = 2
-"""Completed samples before the wanted one: its frame may begin in the read before, running totals need a
-reference."""
+"""Reads with samples to include before the first sample: its frame may begin in the read before, and running
+totals need a reference."""
 
 
 class Moment(NamedTuple):
-    """One read and the samples that it completed.
+    """One read, with the samples that it completed.
 
     Parameters
     ----------
     arrival : Arrival
         The read.
     datagrams : bytes
-        The increments that were published then; with a rate filter that lags, of earlier samples.
+        The increments published after it; with a rate filter that has a delay, those of earlier samples.
     first, last : int
         Counters of the samples; `last` is less than `first` when there are none.
     """
@@ -39,12 +39,12 @@ class Moment(NamedTuple):
 
 
 class History:
-    """Ring of the newest reads; used by the service's loop alone.
+    """Ring buffer of the newest reads; used by the service loop only.
 
     Parameters
     ----------
     max_bytes : int
-        Most memory that it takes; beyond it the oldest reads are dropped.
+        Maximum memory; the oldest reads are dropped above it.
     """
 
     def __init__(self, max_bytes: int = MAX_BYTES) -> None:
@@ -70,17 +70,17 @@ class History:
             self._bytes += len(newest.datagrams)
 
     def since(self, counter: int) -> list[Moment]:
-        """Return what is needed to decode a sample, and all that came after.
+        """Return the reads needed to decode a sample, and all later ones.
 
         Parameters
         ----------
         counter : int
-            Of the sample; where the unit has restarted meanwhile, the newest of that number.
+            Counter of the sample; after a restart of the unit the newest sample with it is meant.
 
         Returns
         -------
         list of Moment
-            Everything that is left when the sample itself is dropped already.
+            All reads, if the sample was already dropped.
         """
         moments, completed = [], 0
         for moment in reversed(self._moments):
@@ -92,7 +92,7 @@ class History:
         return moments[::-1]
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Remove everything."""
         self._moments.clear()
         self._bytes = 0
 

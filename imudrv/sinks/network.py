@@ -1,4 +1,4 @@
-"""Datagrams over the network: UDP to one receiver, TCP to all who connect."""
+"""Datagrams over the network: UDP to one receiver, TCP to every client."""
 
 import select
 import socket
@@ -15,8 +15,8 @@ MAX_CLIENTS: Final = 32
 _UDP_PIECE: Final = 18  # 1368 bytes: with its headers within an Ethernet frame
 _TCP_PIECE: Final = 256
 _RETRY_S: Final = 0.5
-_REFUSED_S: Final = 2.0  # hosts tell of a closed port once a second at the most
-_LAST_SECOND_S: Final = 1.0
+_REFUSED_S: Final = 2.0  # hosts report a closed port at most once a second
+_CLOSE_S: Final = 1.0
 
 _Resolved: TypeAlias = tuple[socket.AddressFamily, tuple[Any, ...]]
 
@@ -24,8 +24,8 @@ _Resolved: TypeAlias = tuple[socket.AddressFamily, tuple[Any, ...]]
 class UdpSink(Sink):
     """UDP to one receiver, or to a broadcast or multicast address.
 
-    Where nobody listens, the receiver's host tells so when the next packet goes; that packet is then sent
-    again, so that nothing is lost from the moment the receiver listens.
+    If no program listens, the host of the receiver reports this when the next packet is sent; that packet is
+    sent again, so that nothing is lost from the moment the receiver listens.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ class UdpSink(Sink):
     Raises
     ------
     InputError
-        No such address.
+        The address is not valid.
     """
 
     def __init__(self, url: str) -> None:
@@ -53,7 +53,7 @@ class UdpSink(Sink):
         self.poll()
 
     def publish(self, batch: Batch) -> None:
-        """Hand a batch on."""
+        """Send a batch."""
         if not self._is_connected:
             self._backlog.dropped += len(batch.datagrams) // SIZE
             return
@@ -63,7 +63,7 @@ class UdpSink(Sink):
             self._lost(error)
 
     def poll(self) -> None:
-        """Send what waits; look for the way again where there is none."""
+        """Send what is queued; try to connect again."""
         try:
             if self._is_connected:
                 self._backlog.flush(self._send)
@@ -77,15 +77,15 @@ class UdpSink(Sink):
 
     @property
     def state(self) -> SinkState:
-        """How it is now."""
+        """Current state."""
         refused = "nobody listens" if time.monotonic() < self._refused_until else ""
         trouble = self._trouble or refused
         counts = self._backlog
         return SinkState(self.url, trouble or "ok", not trouble, counts.sent, counts.dropped, counts.queued)
 
     def close(self) -> None:
-        """Send what waits, for a second at the most, and let go."""
-        deadline = time.monotonic() + _LAST_SECOND_S
+        """Send what is queued for at most a second, and close."""
+        deadline = time.monotonic() + _CLOSE_S
         while self._backlog.queued and (left := deadline - time.monotonic()) > 0:
             select.select([], [self._socket], [], left)
             self.poll()
@@ -106,13 +106,13 @@ class UdpSink(Sink):
         return written
 
     def _lost(self, error: OSError) -> None:
-        """There is no way to the receiver; what waits would come too late."""
+        """Report a lost connection and drop the queue, which would arrive too late."""
         self._trouble = (error.strerror or str(error)).lower()
         self._backlog.abandon()
 
 
 class _Client:
-    """One who connected, with what waits for it."""
+    """Client, with its queue."""
 
     def __init__(self, connection: socket.socket) -> None:
         connection.setblocking(False)
@@ -121,15 +121,15 @@ class _Client:
         self.backlog = Backlog(_TCP_PIECE)
 
     def put(self, datagrams: bytes) -> bool:
-        """Hand datagrams on; whether the client is still there."""
+        """Send datagrams; return whether the client is still connected."""
         try:
             self.backlog.put(datagrams, self.connection.send)
         except OSError:
             return False
         return True
 
-    def look(self) -> bool:
-        """Send what waits and throw away what the client says; whether it is still there."""
+    def service(self) -> bool:
+        """Send what is queued and discard what the client sends; return whether it is still connected."""
         try:
             self.backlog.flush(self.connection.send)
             return self.connection.recv(1 << 16) != b""
@@ -140,27 +140,27 @@ class _Client:
 
 
 class TcpSink(Sink):
-    """TCP server; each client has its own queue, and one that stops reading loses its own samples only.
+    """TCP server; each client has its own queue, and one that stops reading loses only its own samples.
 
-    A client that says it has nothing more to say is taken for gone.
+    A client that shuts down its sending side counts as disconnected.
 
     Parameters
     ----------
     url : str
         ``tcp://HOST:PORT``; without a host only this machine is served (127.0.0.1); port 0 takes a free one,
-        which the state tells.
+        given in the state.
 
     Raises
     ------
     InputError
-        No such address, or one that cannot be had.
+        The address is not valid or cannot be used.
     """
 
     def __init__(self, url: str) -> None:
         super().__init__(url)
         family, address = _resolve(url, "127.0.0.1", socket.SOCK_STREAM)
         self._clients: list[_Client] = []
-        self._sent = self._dropped = 0  # of clients that have gone
+        self._sent = self._dropped = 0  # of disconnected clients
         self._listener = socket.socket(family, socket.SOCK_STREAM)
         try:
             self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -170,22 +170,22 @@ class TcpSink(Sink):
             self._listener.close()
             raise InputError(
                 f"{url}: expected an address of this machine and a free port, "
-                f"got: {error.strerror or error}; take another one"
+                f"got: {error.strerror or error}; choose another one"
             ) from error
         self._listener.setblocking(False)
         host, port = self._listener.getsockname()[:2]
         self._where = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
     def publish(self, batch: Batch) -> None:
-        """Hand a batch on."""
+        """Send a batch."""
         gone = [client for client in self._clients if not client.put(batch.datagrams)]
         for client in gone:
-            self._part(client)
+            self._remove(client)
 
     def poll(self) -> None:
-        """Take new clients, part from those that left, send what waits."""
-        for client in [client for client in self._clients if not client.look()]:
-            self._part(client)
+        """Accept new clients, remove disconnected ones, send what is queued."""
+        for client in [client for client in self._clients if not client.service()]:
+            self._remove(client)
         for _ in range(MAX_CLIENTS):
             try:
                 connection, _ = self._listener.accept()
@@ -198,7 +198,7 @@ class TcpSink(Sink):
 
     @property
     def state(self) -> SinkState:
-        """How it is now."""
+        """Current state."""
         count = len(self._clients)
         clients = "1 client" if count == 1 else f"{count} clients" if count else "waiting for a client"
         counts = [client.backlog for client in self._clients]
@@ -212,21 +212,21 @@ class TcpSink(Sink):
         )
 
     def close(self) -> None:
-        """Send what waits, for a second at the most, and let go."""
+        """Send what is queued for at most a second, and close."""
         self._listener.close()
-        deadline = time.monotonic() + _LAST_SECOND_S
+        deadline = time.monotonic() + _CLOSE_S
         while waiting := [client for client in self._clients if client.backlog.queued]:
             left = deadline - time.monotonic()
             if left <= 0:
                 break
             _, ready, _ = select.select([], [client.connection for client in waiting], [], left)
             for client in waiting:
-                if client.connection in ready and not client.look():
-                    self._part(client)
+                if client.connection in ready and not client.service():
+                    self._remove(client)
         for client in list(self._clients):
-            self._part(client)
+            self._remove(client)
 
-    def _part(self, client: _Client) -> None:
+    def _remove(self, client: _Client) -> None:
         client.backlog.abandon()
         client.connection.close()
         self._clients.remove(client)
@@ -235,7 +235,7 @@ class TcpSink(Sink):
 
 
 def _resolve(url: str, default_host: str | None, kind: socket.SocketKind) -> _Resolved:
-    """Find the address that a URL means; without a default the host must be given."""
+    """Return the address of a URL; without a default the host must be given."""
     try:
         parts = urlsplit(url)
         host, port = parts.hostname or default_host, parts.port
@@ -247,8 +247,8 @@ def _resolve(url: str, default_host: str | None, kind: socket.SocketKind) -> _Re
         found = socket.getaddrinfo(host, port, type=kind)
     except OSError as error:
         raise InputError(
-            f"{url}: expected a host that this machine knows, got {host!r}: {error.strerror or error}; "
-            "check the name or give the address in numbers"
+            f"{url}: expected a known host, got {host!r}: {error.strerror or error}; "
+            "check the name or give a numeric address"
         ) from error
     family, _, _, _, address = found[0]
     return family, address

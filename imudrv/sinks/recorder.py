@@ -1,7 +1,7 @@
-"""The recorder: everything that came and went, into an MCAP file that a kill cannot spoil.
+"""Recorder of all input and output into an MCAP file that stays readable after a kill.
 
-The loop only puts things into queues; a thread writes them each 50 ms, wire bytes first. The file is neither
-chunked nor compressed, for a chunk would hold data back; `imudrv.recording.pack.pack` does both later.
+The loop only appends to queues; a thread writes them every 50 ms, wire bytes first. The file is neither
+chunked nor compressed, as a chunk would delay data; `imudrv.recording.pack.pack` does both later.
 """
 
 import json
@@ -30,12 +30,12 @@ from imudrv.wire.datagram import SIZE
 from imudrv.wire.layout import Layout
 
 QUEUE_BYTES: Final = 32 << 20
-"""What waits in each queue at the most: 15 s of single reads at 20 kHz, minutes at 1 kHz."""
+"""Maximum size of each queue: 15 s of single reads at 20 kHz, minutes at 1 kHz."""
 _OVERHEAD: Final = 64
-_PIECE: Final = 256  # reads, and batches, of one piece
+_PIECE: Final = 256  # reads, and batches, written at a time
 
-# A message, packed here in 0.2 us where the library takes 4, for the loop cannot run meanwhile. So the
-# library does not know of messages, and its summary has no statistics.
+# A message; packing takes 0.2 us here and 4 us in the library, during which the loop cannot run. So the
+# summary of the library has no statistics of messages.
 _MESSAGE: Final = struct.Struct("<BQHIQQ")
 _BODY: Final = _MESSAGE.size - 9
 
@@ -45,30 +45,30 @@ T = TypeVar("T")
 class Recorder:
     """Writer of one recording.
 
-    Nothing here blocks or raises but the constructor: what the disk cannot take waits in bounded queues whose
-    oldest entries are dropped, and the state tells.
+    Only the constructor blocks or raises: what the disk cannot take is kept in bounded queues whose oldest
+    entries are dropped, and `state` reports it.
 
     Parameters
     ----------
     path : Path
-        There must be no such file yet.
+        Name of a new file.
     layout : Layout
-        Of the unit.
+        Layout of the unit.
     profile : bytes
-        The profile's file.
+        Contents of the profile file.
     calibration : bytes or None
-        The calibration's file.
+        Contents of the calibration file.
     source : Source
-        What stands behind the port.
+        Kind of data source.
     port : str
-        Its URL.
+        URL of the port.
     unit : str
-        The unit's serial number; empty if it is not known.
+        Serial number of the unit; empty if not known.
 
     Raises
     ------
     InputError
-        There is such a file, the folder cannot be written to, or the disk is full.
+        The file exists, the folder cannot be written to, or the disk is full.
     """
 
     def __init__(
@@ -89,37 +89,36 @@ class Recorder:
         self._notes: deque[tuple[int, int, Mapping[str, object]]] = deque(maxlen=1000)
         self._calibrations: deque[tuple[int, bytes]] = deque(maxlen=10)
         self._put = 0
-        self._told = 0
+        self._reported = 0
         self._sequences = [0] * 5
         self._staging = _Staging()
-        # The library writes to anything with write and tell.
         self._writer = Writer(self._staging, use_chunking=False, use_statistics=False)
         self._begin(profile, calibration, source, port, unit)
         self._spool = AppendThread(path, self._staging.take(), self._next_piece, self._last_piece)
 
     def arrived(self, arrival: Arrival) -> None:
-        """Take in what the port brought; to be called before it is used.
+        """Record a read of the port; call it before the data are used.
 
         Parameters
         ----------
         arrival : Arrival
-            Not changed any more.
+            The read; it must not change any more.
         """
         if len(arrival.data):
             self._wire.put(arrival)
 
     def publish(self, batch: Batch) -> None:
-        """Take in a batch."""
+        """Record a batch."""
         self._put += len(batch.datagrams) // SIZE
         self._datagrams.put(batch.datagrams)
 
     def catch_up(self, moments: Sequence[Moment]) -> None:
-        """Take in what was already past when the recording was asked for; to be called before the rest.
+        """Record reads and samples from before the request; call it before any other method.
 
         Parameters
         ----------
         moments : sequence of Moment
-            From a `History`.
+            Reads from a `History`.
         """
         datagrams = [moment.datagrams for moment in moments if moment.datagrams]
         self._put += sum(map(len, datagrams)) // SIZE
@@ -127,49 +126,51 @@ class Recorder:
         self._datagrams.extend(datagrams)
 
     def status(self, status: Mapping[str, object]) -> None:
-        """Take in how the service is.
+        """Record the state of the service.
 
         Parameters
         ----------
         status : mapping
-            Of what JSON knows; not changed any more.
+            Values that JSON can represent; it must not change any more.
         """
         self._notes.append((now_ns(), _STATUS, status))
 
     def event(self, t_ns: int, text: str) -> None:
-        """Take in what happened.
+        """Record an event.
 
         Parameters
         ----------
         t_ns : int
-            When, host clock.
+            Host time.
         text : str
-            What, in plain words.
+            What happened.
         """
         self._notes.append((t_ns, _EVENTS, {"text": text}))
 
     def calibration(self, t_ns: int, calibration: bytes) -> None:
-        """Take in a calibration that was swapped in.
+        """Record a new calibration.
 
         Parameters
         ----------
         t_ns : int
-            When, host clock: it holds for later reads.
+            Host time; the calibration applies to later reads.
         calibration : bytes
-            Its file.
+            Contents of its file.
         """
         self._calibrations.append((t_ns, calibration))
 
     def poll(self) -> None:
-        """Tell in the recording what it lacks."""
+        """Record an event for reads that were lost since the last call."""
         lost = self._wire.dropped
-        if lost > self._told and not self._spool.trouble:
-            self.event(now_ns(), f"recording: {lost - self._told} reads of the port are missing before this")
-            self._told = lost
+        if lost > self._reported and not self._spool.trouble:
+            self.event(
+                now_ns(), f"recording: {lost - self._reported} reads of the port are missing before this"
+            )
+            self._reported = lost
 
     @property
     def state(self) -> SinkState:
-        """How it is now; in samples, while the words tell of reads that are lost."""
+        """Current state, in samples; the text gives the number of lost reads."""
         trouble = self._spool.trouble
         lost = self._wire.dropped
         words = trouble or "ok"
@@ -185,20 +186,17 @@ class Recorder:
         self._spool.close()
 
     def _begin(self, profile: bytes, calibration: bytes | None, source: Source, port: str, unit: str) -> None:
-        """Stage what every recording begins with."""
+        """Write the start of the file: channels, origin, profile, calibration."""
         writer, t_ns = self._writer, now_ns()
         writer.start(library=f"imu50 {version('imu50')}")
         status = writer.register_schema("imu50.Status", SchemaEncoding.JSONSchema, _STATUS_SCHEMA)
         event = writer.register_schema("imu50.Event", SchemaEncoding.JSONSchema, _EVENT_SCHEMA)
         wire = format.CAN_MESSAGES if self._can else format.BYTES
-        for number, topic, encoding, schema in (
-            (_WIRE, format.WIRE, wire, 0),
-            (_INCREMENTS, format.INCREMENTS, format.DATAGRAMS, 0),
-            (_STATUS, format.STATUS, MessageEncoding.JSON, status),
-            (_EVENTS, format.EVENTS, MessageEncoding.JSON, event),
-        ):
-            registered = writer.register_channel(topic, encoding, schema)
-            assert registered == number
+        # the library numbers channels in this order: _WIRE, _INCREMENTS, _STATUS, _EVENTS
+        writer.register_channel(format.WIRE, wire, 0)
+        writer.register_channel(format.INCREMENTS, format.DATAGRAMS, 0)
+        writer.register_channel(format.STATUS, MessageEncoding.JSON, status)
+        writer.register_channel(format.EVENTS, MessageEncoding.JSON, event)
         origin = {
             "version": version("imu50"),
             "unit": unit,
@@ -252,7 +250,7 @@ _EVENT_SCHEMA: Final = json.dumps({"type": "object", "properties": {"text": {"ty
 
 
 class _Queue(Generic[T]):
-    """From the loop to the thread, bounded by bytes; each side counts for itself, so nothing is locked."""
+    """Queue from the loop to the thread, bounded in bytes; each side has its own counts, without a lock."""
 
     def __init__(self, size: Callable[[T], int]) -> None:
         self.dropped = 0
@@ -262,13 +260,13 @@ class _Queue(Generic[T]):
         self._put = self._taken = 0
 
     def put(self, item: T) -> None:
-        """Append, by the loop; drop the oldest of what is too much."""
+        """Append (in the loop); drop the oldest items above the limit."""
         self._items.append(item)
         self._put += self._size(item) + _OVERHEAD
         self._drop()
 
     def extend(self, items: Sequence[T]) -> None:
-        """Append many at once, by the loop; drop the oldest of what is too much."""
+        """Append several items (in the loop); drop the oldest above the limit."""
         self._items.extend(items)
         self._put += sum(map(self._size, items)) + _OVERHEAD * len(items)
         self._drop()
@@ -280,7 +278,7 @@ class _Queue(Generic[T]):
                 self.dropped += 1
 
     def take(self, count: int) -> list[T]:
-        """Take up to `count` items, by the thread."""
+        """Remove up to `count` items (in the thread) and return them."""
         items: list[T] = []
         with suppress(IndexError):
             while len(items) < count:
@@ -298,7 +296,7 @@ def _array_size(arrival: Arrival) -> int:
 
 
 class _Staging(BytesIO):
-    """Where the library writes to; it tells places in the file."""
+    """Buffer that the library writes to; `tell` gives positions in the file."""
 
     def __init__(self) -> None:
         super().__init__()

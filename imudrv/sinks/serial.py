@@ -1,4 +1,4 @@
-"""Datagrams on a serial line."""
+"""Datagrams to a serial line."""
 
 import os
 import termios
@@ -21,23 +21,24 @@ from imudrv.wire.datagram import SIZE
 BAUDRATE: Final = 921_600
 _PIECE: Final = 64
 _RETRY_S: Final = 1.0
-_LAST_SECOND_S: Final = 1.0
+_CLOSE_S: Final = 1.0
 
 
 class SerialSink(Sink):
-    """A serial port; where it is absent or unplugged it is opened again once it is there.
+    """Serial port; if absent or unplugged, it is opened as soon as it appears.
 
-    Opening may take a driver milliseconds, hence a thread does it.
+    Opening may take milliseconds, hence a thread does it.
 
     Parameters
     ----------
     url : str
-        ``serial:///dev/ttyUSB1?baudrate=921600``, 8N1 unless ``bytesize``, ``parity``, ``stopbits`` say else.
+        ``serial:///dev/ttyUSB1?baudrate=921600``, 8N1 unless ``bytesize``, ``parity`` or
+        ``stopbits`` is given.
 
     Raises
     ------
     InputError
-        No path, or no such settings.
+        The path is missing, or a setting is not valid.
     """
 
     def __init__(self, url: str) -> None:
@@ -51,7 +52,7 @@ class SerialSink(Sink):
         self.poll()
 
     def publish(self, batch: Batch) -> None:
-        """Hand a batch on."""
+        """Send a batch."""
         if self._port is None:
             self._backlog.dropped += len(batch.datagrams) // SIZE
             return
@@ -61,7 +62,7 @@ class SerialSink(Sink):
             self._lose(error)
 
     def poll(self) -> None:
-        """Send what waits; open the port again if it is lost."""
+        """Send what is queued; open the port again if it is lost."""
         if self._port is not None:
             try:
                 self._backlog.flush(self._write)
@@ -74,22 +75,22 @@ class SerialSink(Sink):
 
     @property
     def state(self) -> SinkState:
-        """How it is now."""
+        """Current state."""
         counts = self._backlog
         is_open = self._port is not None
         words = "ok" if is_open else self._trouble
         return SinkState(self.url, words, is_open, counts.sent, counts.dropped, counts.queued)
 
     def close(self) -> None:
-        """Send what waits, for a second at the most, and let go."""
-        deadline = time.monotonic() + _LAST_SECOND_S
+        """Send what is queued for at most a second, and close."""
+        deadline = time.monotonic() + _CLOSE_S
         if self._opening is not None:
-            self._opening.join(_LAST_SECOND_S)
+            self._opening.join(_CLOSE_S)
         while self._port is not None and self._backlog.queued and time.monotonic() < deadline:
             self.poll()
             time.sleep(0.005)
         self._backlog.abandon()
-        self._let_go()
+        self._close_port()
 
     def _open(self) -> None:
         parity = self._line.parity[0].upper()
@@ -106,26 +107,25 @@ class SerialSink(Sink):
             )
         except OSError as error:
             self._trouble = explain(self._path, error)
-        except ValueError as error:  # a rate that the device does not have
+        except ValueError as error:  # baud rate not supported
             self._trouble = str(error)
 
     def _write(self, data: bytes) -> int:
-        # pyserial's own write would spin while the port takes nothing.
-        assert self._port is not None
-        return os.write(self._port.fileno(), data)
+        # The write of pyserial would spin while the port is blocked.
+        return 0 if self._port is None else os.write(self._port.fileno(), data)
 
     def _lose(self, error: OSError) -> None:
         self._trouble = f"lost: {error.strerror or error}"
         self._retry_at = time.monotonic() + _RETRY_S
         self._backlog.abandon()
-        self._let_go()
+        self._close_port()
 
-    def _let_go(self) -> None:
+    def _close_port(self) -> None:
         port, self._port = self._port, None
         if port is None:
             return
         with suppress(OSError, termios.error):
-            termios.tcflush(port.fileno(), termios.TCOFLUSH)  # else closing waits for a line that is stuck
+            termios.tcflush(port.fileno(), termios.TCOFLUSH)  # otherwise closing may wait for a blocked line
         port.close()
 
 

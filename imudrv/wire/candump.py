@@ -202,11 +202,36 @@ def _scan(
 
 @kernel
 def _parse(text: Bytes, p: int, message: np.void, names: Bytes) -> int:
-    """Read the line at `p` into `message`, whose data are zeros; no step goes past the line's newline.
+    """Read the line at `p` into `message`, whose data are zeros; no step passes the newline of the line.
 
-    Returns 0 for a message of the channel that is read, the place of the channel's name for one of another
-    channel, and `_NO_MESSAGE` otherwise.
+    Returns 0 for a message of the channel that is read, the position of the channel name for a message of
+    another channel, and `_NO_MESSAGE` otherwise.
     """
+    p = _parse_time(text, p, message)
+    if p == _NO_MESSAGE:
+        return _NO_MESSAGE
+    channel = _skip_blanks(text, p)
+    end = _end_of_word(text, channel)
+    begin = _skip_blanks(text, end)
+    if channel == p or end == channel or begin == end:
+        return _NO_MESSAGE
+    p = _parse_identifier(text, begin, message)
+    if p == _NO_MESSAGE:
+        return _NO_MESSAGE
+    p = _parse_data(text, p, message)
+    if p == _NO_MESSAGE:
+        return _NO_MESSAGE
+    end_of_data = _skip_blanks(text, p)
+    if end_of_data > p and (text[end_of_data] == _RECEIVED or text[end_of_data] == _TRANSMITTED):
+        end_of_data = _skip_blanks(text, end_of_data + 1)
+    if text[end_of_data] != _NEWLINE:
+        return _NO_MESSAGE
+    return 0 if _is_name(text, channel, end - channel, names[0]) else channel
+
+
+@kernel
+def _parse_time(text: Bytes, p: int, message: np.void) -> int:
+    """Read ``(seconds.fraction)`` at `p`; return the position after it, or `_NO_MESSAGE`."""
     if text[p] != _OPEN:
         return _NO_MESSAGE
     p, seconds, digits = _decimal(text, p + 1)
@@ -218,21 +243,12 @@ def _parse(text: Bytes, p: int, message: np.void, names: Bytes) -> int:
     for _ in range(9 - digits):
         fraction *= 10
     message["t_ns"] = seconds * NS_PER_S + fraction
-    channel = _skip_blanks(text, p + 1)
-    if channel == p + 1:
-        return _NO_MESSAGE
-    p = channel
-    while text[np.uint64(p)] > _SPACE and text[np.uint64(p)] == names[0, np.uint64(p - channel)]:
-        p += 1
-    other = 0
-    if text[np.uint64(p)] > _SPACE or names[0, np.uint64(p - channel)] != 0:
-        other = channel
-        while text[p] > _SPACE:
-            p += 1
-    begin = _skip_blanks(text, p)
-    if p == channel or begin == p:
-        return _NO_MESSAGE
+    return p + 1
 
+
+@kernel
+def _parse_identifier(text: Bytes, begin: int, message: np.void) -> int:
+    """Read the identifier at `begin` and its ``#``; return the position after it, or `_NO_MESSAGE`."""
     p = begin
     identifier = np.int64(0)
     while p < begin + 8 and _NIBBLES[text[p]] != _NOT_HEX:
@@ -242,7 +258,12 @@ def _parse(text: Bytes, p: int, message: np.void, names: Bytes) -> int:
     if (p - begin != 3 and p - begin != 8) or identifier > limit or text[p] != _HASH:
         return _NO_MESSAGE
     message["id"] = identifier
-    p += 1
+    return p + 1
+
+
+@kernel
+def _parse_data(text: Bytes, p: int, message: np.void) -> int:
+    """Read the data at `p`, for CAN FD after ``#`` and flags; return their end, or `_NO_MESSAGE`."""
     longest = 8
     message["fd"] = 0
     if text[p] == _HASH:
@@ -251,7 +272,6 @@ def _parse(text: Bytes, p: int, message: np.void, names: Bytes) -> int:
         message["fd"] = 1
         longest = 64
         p += 2
-
     length = 0
     while length < longest:
         high = _NIBBLES[text[np.uint64(p)]]
@@ -264,29 +284,37 @@ def _parse(text: Bytes, p: int, message: np.void, names: Bytes) -> int:
         length += 1
         p += 2
     message["length"] = length
-    end = _skip_blanks(text, p)
-    if end > p and (text[end] == _RECEIVED or text[end] == _TRANSMITTED):
-        end = _skip_blanks(text, end + 1)
-    return other if text[end] == _NEWLINE else _NO_MESSAGE
+    return p
 
 
 @kernel
 def _row_of(text: Bytes, begin: int, names: Bytes) -> int:
-    """Row of the channel whose name is at `begin`; a new channel gets the first free row."""
-    length = 0
-    while text[begin + length] > _SPACE:
-        length += 1
+    """Return the row of the channel whose name is at `begin`; a new channel gets the first free row."""
+    length = _end_of_word(text, begin) - begin
     for row in range(MOST_CHANNELS):
         if names[row, 0] == 0:
             for k in range(length):
                 names[row, k] = text[begin + k]
             return row
-        same = 0
-        while same < length and text[begin + same] == names[row, same]:
-            same += 1
-        if same == length and names[row, same] == 0:
+        if _is_name(text, begin, length, names[row]):
             return row
     return MOST_CHANNELS
+
+
+@kernel
+def _is_name(text: Bytes, begin: int, length: int, name: Bytes) -> bool:
+    """Return whether the word at `begin` is a name, which ends with a zero."""
+    for k in range(length):
+        if text[np.uint64(begin + k)] != name[np.uint64(k)]:
+            return False
+    return bool(name[length] == 0)
+
+
+@kernel
+def _end_of_word(text: Bytes, p: int) -> int:
+    while text[np.uint64(p)] > _SPACE:
+        p += 1
+    return p
 
 
 class _Decimal(NamedTuple):

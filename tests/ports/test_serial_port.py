@@ -176,7 +176,7 @@ def test_a_refusal_says_who_may_and_how_to_become_one(tmp_path):
     device.touch()
     text = explain(str(device), PermissionError(13, "Permission denied"))
     group = Path(device).group()
-    assert f"no permission for {device}; it is the group's {group}: `sudo usermod -aG {group} $USER`" in text
+    assert f"no permission for {device}; its group is {group}: `sudo usermod -aG {group} $USER`" in text
 
 
 def test_the_stream_of_a_tcp_server_comes_whole_from_its_first_byte(server, rs422, opened, arrivals):

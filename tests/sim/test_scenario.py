@@ -87,17 +87,17 @@ def test_a_missing_calibration_file_is_named(tmp_path: Path) -> None:
         (
             {"rest": {"duration_s": 1.0}},
             {"faults": {"stream": {"bit_flips": 0.6, "bytes_lost": 0.6}}},
-            "1 at most, got 1.2",
+            "at most 1, got 1.2",
         ),
         (
             {"rest": {"duration_s": 1.0}},
             {"faults": {"can": {"lost": 0.9, "swapped": 0.6}}},
-            "1 at most, got 1.5",
+            "at most 1, got 1.5",
         ),
         (
             {"rest": {"duration_s": 1.0}},
             {"faults": {"unplugs": [{"at_s": 1.0, "duration_s": 2.0}, {"at_s": 2.5, "duration_s": 1.0}]}},
-            "one after the other, got one at 2.5 s before that of 1 s is over",
+            "one after the other, got one at 2.5 s before the end of that at 1 s",
         ),
         (
             {"rest": {"duration_s": 1.0}},

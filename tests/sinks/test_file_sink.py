@@ -90,7 +90,7 @@ def test_a_file_that_exists_is_not_touched(tmp_path: Path) -> None:
     [
         ("file:out.npz", "export the recording"),
         ("file:/no/such/folder/out.csv", "cannot be written: No such file"),
-        ("http://somewhere", "expected udp:, tcp:, serial:, can:, file: in front, got 'http'"),
+        ("http://somewhere", "expected udp:, tcp:, serial:, can:, file: at the start, got 'http'"),
     ],
 )
 def test_a_way_out_that_cannot_be_is_refused(url: str, told: str) -> None:
