@@ -3,17 +3,28 @@
 import argparse
 from hashlib import sha256
 from pathlib import Path
+from typing import Final, get_args
 
 from rich.console import Console
 
 from calib.certificate import certificate, check_target, write
-from calib.cli.arguments import Stated, check_output, known_point, written_text
+from calib.cli.arguments import (
+    KnownPoint,
+    add_certificate_output,
+    add_channel,
+    add_gauge,
+    check_output,
+    known_point,
+    written_text,
+)
+from calib.estimation.result import Extra
 from calib.identification import PriorCalibration, identify_captures
 from calib.lever_arms.gauge import Gauge, LeverArms, convert
 from calib.reports.identification import report_for_terminal, report_html, report_text
 from calib.result_file import result_document, write_json
 from imudrv import profiles
-from imudrv.calibration import Calibration, read_calibration_file
+from imudrv.calibration import Calibration, read_calibration_file, require_unit
+from imudrv.cli.arguments import add_profile
 from imudrv.errors import InputError
 from imudrv.files import settings_file
 from imudrv.files.atomic import atomic_write
@@ -21,64 +32,103 @@ from imudrv.recording.reader import Recording
 from imudrv.site import Site
 from imudrv.terminal import progress
 
+EXAMPLE: Final = (
+    "z-up.raw x-up.raw y-up.raw --profile imu50-rs422 --calibration unit.yaml --site site.yaml -o new.yaml"
+)
 
-def run_identify(arguments: argparse.Namespace) -> None:
+_EXTRAS: Final[tuple[Extra, ...]] = get_args(Extra)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    add = parser.add_argument
+    text = "wire bytes, candump logs, or recordings (.mcap), which contain their profile"
+    add("captures", type=Path, nargs="+", metavar="CAPTURE", help=text)
+    add_profile(parser)
+    add_channel(parser)
+    text = "calibration of the unit; default: the one in the recordings"
+    add("--calibration", type=Path, metavar="C.yaml", help=text)
+    text = "site of the captures: latitude, longitude, height"
+    add("--site", type=Path, required=True, metavar="S.yaml", help=text)
+    text = "serial number of the unit; the calibration of another unit is rejected"
+    add("--unit", metavar="SERIAL", help=text)
+    add("--method", choices=("joint", "plain"), default="joint", help="default: joint")
+    add_gauge(parser, "--gauge")
+    text = (
+        "fixed: the origin of the body frame does not move, as on a turntable; determines all nine components"
+    )
+    add("--pivot", choices=("free", "fixed"), default="free", help=text)
+    text = f"estimate more parameters: {','.join(_EXTRAS)}"
+    add("--estimate", type=_extra_parameters, default=(), metavar="NAMES", help=text)
+    add_certificate_output(parser)
+    add("--json", type=Path, metavar="R.json", help="the whole result as JSON")
+    add("--report", type=Path, metavar="R.html", help="report with figures, one file")
+
+
+def _extra_parameters(text: str) -> tuple[Extra, ...]:
+    names = tuple(text.split(","))
+    if unknown := [name for name in names if name not in _EXTRAS]:
+        raise argparse.ArgumentTypeError(f"expected {' or '.join(_EXTRAS)}, got {unknown[0]!r}")
+    return tuple(name for name in _EXTRAS if name in names)
+
+
+def run(arguments: argparse.Namespace) -> None:
     """Identify the lever arms from captures."""
-    stated = known_point(arguments.at)
+    point = known_point(arguments.at)
     inputs = (*arguments.captures, arguments.profile, arguments.calibration, arguments.site)
     for output in filter(None, (arguments.output, arguments.json, arguments.report)):
         check_output(output, *inputs)
-    basis = _basis(arguments)
-    check_target(arguments.output, basis.calibration)
+    prior = _prior(arguments)
+    check_target(arguments.output, prior.calibration)
     site = settings_file.read(arguments.site, Site)
     profile = profiles.load(arguments.profile) if arguments.profile else None
     size = sum(path.stat().st_size for path in arguments.captures if path.exists())
     with progress("identify", 2 * size) as advance:  # each capture is read twice
-        findings = identify_captures(
+        result = identify_captures(
             arguments.captures,
             profile,
-            basis,
+            prior,
             site,
             method=arguments.method,
             pivot=arguments.pivot,
-            nine=arguments.gauge == "given" and stated is None,
+            nine=arguments.gauge == "given" and point is None,
             extra=arguments.estimate,
             channel=arguments.channel,
             advance=advance,
         )
-    arms = _wanted(findings.arms, arguments.gauge, stated)
-    told = (arms, convert(arms, "x" if arms.gauge == "centroid" else "centroid"))
+    arms = _in_gauge(result.arms, arguments.gauge, point)
+    gauges = (arms, convert(arms, "x" if arms.gauge == "centroid" else "centroid"))
     written = []
-    try:  # files first: whoever reads the text may leave
+    try:  # files first: the reader of the text may go away
         if arguments.json is not None:
-            write_json(arguments.json, result_document(findings, arms))
+            write_json(arguments.json, result_document(result, arms))
             written.append(f"{arguments.json}: the result")
         if arguments.report is not None:
             with atomic_write(arguments.report) as file:
-                file.write(report_html(findings, told).encode())
+                file.write(report_html(result, gauges).encode())
             written.append(f"{arguments.report}: the report")
-        write(arguments.output, certificate(findings, arms))
-        written.append(written_text(arguments.output, basis.calibration, arms))
+        write(arguments.output, certificate(result, arms))
+        written.append(written_text(arguments.output, prior.calibration, arms))
     finally:
         console = Console(highlight=False)
         if console.is_terminal:
-            console.print(report_for_terminal(findings, told))
+            console.print(report_for_terminal(result, gauges))
         else:
-            print(report_text(findings, told), end="")
+            print(report_text(result, gauges), end="")
         print(*written, sep="\n")
 
 
-def _wanted(arms: LeverArms, gauge: Gauge | None, stated: Stated | None) -> LeverArms:
-    """The arms in the gauge asked for; nobody asked: in that of the estimate."""
-    if stated is None and gauge in (None, arms.gauge):
+def _in_gauge(arms: LeverArms, gauge: Gauge | None, point: KnownPoint | None) -> LeverArms:
+    """Return the arms in the requested gauge, by default that of the estimate."""
+    if point is None and gauge in (None, arms.gauge):
         return arms
     if gauge is None:
         raise InputError("--at: expected with --gauge given")
-    return convert(arms, gauge, stated)
+    return convert(arms, gauge, point)
 
 
-def _basis(arguments: argparse.Namespace) -> PriorCalibration:
-    """The calibration given, or the one that the recordings agree on."""
+def _prior(arguments: argparse.Namespace) -> PriorCalibration:
+    """Return the given calibration, or the one that all recordings contain."""
     if arguments.calibration is not None:
         file = read_calibration_file(arguments.calibration, arguments.unit)
         return PriorCalibration(file.model, arguments.calibration.name, file.sha256)
@@ -86,20 +136,16 @@ def _basis(arguments: argparse.Namespace) -> PriorCalibration:
     for path in arguments.captures:
         text = Recording(path).calibration_text if path.suffix == ".mcap" else None
         if text is None:
-            raise InputError(f"{path}: expected --calibration, for there is none in it")
+            raise InputError(f"{path}: expected --calibration, for this capture contains none")
         texts.setdefault(text, str(path))
     if len(texts) > 1:
         raise InputError(
-            f"expected recordings made with one calibration, got others in {' and '.join(texts.values())}; "
-            "say which with --calibration"
+            "expected recordings with the same calibration, got different ones in "
+            f"{' and '.join(texts.values())}; choose one with --calibration"
         )
     ((text, path),) = texts.items()
     calibration = settings_file.parse_text(text.encode(), Calibration, f"{path}: calibration")
-    if arguments.unit not in (None, calibration.serial_number):
-        raise InputError(
-            f"{path}: expected a recording of unit {arguments.unit!r}, "
-            f"got one of {calibration.serial_number!r}"
-        )
+    require_unit(calibration, arguments.unit, path)
     return PriorCalibration(
         calibration, f"calibration in {Path(path).name}", sha256(text.encode()).hexdigest()
     )

@@ -34,9 +34,9 @@ from imudrv.profiles.schema import Profile
 from imudrv.records import INCREMENTS, PULSES, Flag, Source
 from imudrv.service.latency import Latency
 from imudrv.service.runtime import SignalFlags, SystemdNotifier, ask_realtime, frozen_gc
-from imudrv.service.settings import Settings, default_status_path
+from imudrv.service.settings import Settings
 from imudrv.service.status import Status, health
-from imudrv.service.status_socket import StatusServer
+from imudrv.service.status_socket import StatusServer, default_status_path
 from imudrv.sinks import open_sink
 from imudrv.sinks.base import Batch, Sink
 from imudrv.sinks.history import History

@@ -1,7 +1,5 @@
 """What the live service is told: its settings file, and the same from the command line."""
 
-import os
-import tempfile
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -69,8 +67,3 @@ def load(path: Path | None, given: dict[str, Any]) -> Settings:
                 f"expected a settings file, or --port, --profile and --calibration; got no --{name}"
             )
     return parse(given, Settings, "command line")
-
-
-def default_status_path() -> Path:
-    """Where the status socket is unless told otherwise: in the user's runtime folder."""
-    return Path(os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()) / "imu50.sock"

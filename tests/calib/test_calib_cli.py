@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import yaml
 
-from calib.cli.main import main
+from calib.cli import main
 from calib.identification import PriorCalibration, identify_captures
 from imudrv.calibration import read_calibration_file, write_calibration
 from imudrv.cli import main as imudrv
@@ -145,9 +145,9 @@ def test_recordings_bring_their_own_profile_and_calibration(
     assert identify("z.raw", "x.raw", "y.raw", "-o", "captured.yaml") == 0
     assert recorded["size_effect"] == yaml.safe_load((here / "captured.yaml").read_text())["size_effect"]
     assert main([*recordings, "--unit", "50-0018"]) == 2
-    assert "z.mcap: expected a recording of unit '50-0018', got one of '50-0017'" in capsys.readouterr().err
+    assert "z.mcap: expected the calibration of unit '50-0018', got that of '50-0017'" in capsys.readouterr().err
     assert main(["identify", "z.mcap", "x.raw", "--site", "site.yaml", "-o", "never.yaml"]) == 2
-    assert "x.raw: expected --calibration, for there is none in it" in capsys.readouterr().err
+    assert "x.raw: expected --calibration, for this capture contains none" in capsys.readouterr().err
 
 
 def test_a_chosen_channel_of_a_log_of_two_units_is_named_in_certificate_and_report(

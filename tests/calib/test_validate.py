@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from calib.certificate import lever_arms_of
-from calib.cli.main import main as calib
+from calib.cli import main as calib
 from calib.detection.noise import Noise
 from calib.lever_arms.gauge import GAUGES, convert
 from calib.reports.html import as_html
