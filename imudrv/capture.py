@@ -1,15 +1,20 @@
 """A capture file, or a recording, through the stages that live samples take: decode, account, compensate."""
 
+import os
 from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
 from imudrv import profiles
+from imudrv.calibration import Calibration, coefficients, read_calibration
 from imudrv.errors import InputError
 from imudrv.imu.clock import ClockModel
 from imudrv.imu.compensation import Compensator
+from imudrv.imu.rate_filter import RateFilterName
+from imudrv.imu.rate_filter import rate_filter as make_filter
 from imudrv.imu.sequence import SequenceTracker
 from imudrv.profiles.schema import Profile
 from imudrv.recording.reader import Recording
@@ -18,11 +23,16 @@ from imudrv.wire.candump import CandumpDecoder
 from imudrv.wire.decoder import CaptureDecoder, FrameDecoder, RejectedRuns
 
 CHUNK_BYTES = 1 << 19
-"""Read at once: small enough for the cache, large enough that Python's part does not show."""
-
-
+"""Bytes read at once: few enough for the cache, many enough that Python's overhead does not matter."""
 READS_AT_ONCE = 1000
-"""Of a recording."""
+"""Reads of a recording that are decoded at once."""
+
+Advance: TypeAlias = Callable[[int], object]
+"""Called with the number of bytes read after each piece, to show progress."""
+
+
+def _no_progress(_: int) -> None:
+    pass
 
 
 class Capture:
@@ -30,22 +40,46 @@ class Capture:
 
     Parameters
     ----------
-    path : Path
-        Wire bytes; for a CAN profile a candump log; where the name ends in ``.mcap`` a recording.
-    profile : Profile, optional
-        What the unit sends. A recording knows it.
+    path : path-like
+        Wire bytes; for a CAN profile a candump log; a name that ends in ``.mcap`` is a recording.
+    profile : Profile or path-like, optional
+        Wire format of the unit: a profile, the name of a shipped one, or the path of its file. A recording
+        contains it.
     channel : str, optional
-        The channel of a candump log to read; needed where the log has several.
+        Channel of a candump log to read; needed if the log has several.
+
+    Attributes
+    ----------
+    path : Path
+    size : int
+        Size of the file, bytes.
+    recording : Recording or None
+        The recording, if the file is one.
+    profile : Profile
+    layout : Layout
+        Layout of the profile.
+    tracker : SequenceTracker
+        Its `counts` are those of the samples read so far; each reading of the file begins anew.
 
     Raises
     ------
     InputError
-        There is no such file, it is empty, it is no recording and there is no profile, or there is a channel
-        and it is no candump log.
+        There is no such file, it is empty, a profile is needed, or there is a channel and the file is no
+        candump log.
+
+    Examples
+    --------
+    >>> imudrv.Capture("z_up.raw", "imu50-rs422")
+    <Capture z_up.raw, imu50-rs422, 0 samples read>
     """
 
-    def __init__(self, path: Path, profile: Profile | None = None, channel: str | None = None) -> None:
-        self.path = path
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        profile: Profile | str | os.PathLike[str] | None = None,
+        channel: str | None = None,
+    ) -> None:
+        self.path = path = Path(path)
         try:
             with path.open("rb") as file:
                 self._head = file.read(1 << 16)
@@ -55,12 +89,12 @@ class Capture:
         if not self._head:
             raise InputError(f"{path}: expected a capture, got an empty file")
         self.recording = Recording(path) if path.suffix == ".mcap" else None
-        if profile is None and self.recording is not None:
-            profile = self.recording.profile
         if profile is None:
-            raise InputError(f"{path}: expected --profile, for only a recording knows what the unit sends")
-        self.profile = profile
-        self.layout = profile.layout()
+            if self.recording is None:
+                raise InputError(f"{path}: expected --profile; only a recording contains its profile")
+            profile = self.recording.profile
+        self.profile = profile if isinstance(profile, Profile) else profiles.load(profile)
+        self.layout = self.profile.layout()
         if channel is not None and (self.recording is not None or not self.layout.can):
             kind = "a recording" if self.recording is not None else f"a capture of {self.layout.name}"
             raise InputError(
@@ -68,13 +102,14 @@ class Capture:
             )
         self.tracker = SequenceTracker(self.layout)
         self._channel = channel
-        self._decoder: CaptureDecoder | FrameDecoder = (
-            FrameDecoder(self.layout) if self.recording is not None else CaptureDecoder(self.layout, channel)
-        )
+        self._decoder: CaptureDecoder | FrameDecoder = FrameDecoder(self.layout)
+
+    def __repr__(self) -> str:
+        return f"<Capture {self.path}, {self.profile.name}, {self.tracker.counts.frames} samples read>"
 
     @property
     def rejected(self) -> dict[Reason, RejectedRuns]:
-        """What was no frame, by reason."""
+        """Input that was no frame, by reason."""
         return self._decoder.rejected
 
     @property
@@ -86,13 +121,13 @@ class Capture:
     def _log(self) -> CandumpDecoder | None:
         return self._decoder.log if isinstance(self._decoder, CaptureDecoder) else None
 
-    def pulses(self, advance: Callable[[int], None]) -> Iterator[Records]:
-        """Decode the file, piece by piece.
+    def pulses(self, advance: Advance = _no_progress) -> Iterator[Records]:
+        """Decode the file from its beginning, piece by piece.
 
         Parameters
         ----------
-        advance : callable
-            Told the number of bytes read after each piece.
+        advance : callable, optional
+            Called with the number of bytes read after each piece.
 
         Yields
         ------
@@ -102,35 +137,38 @@ class Capture:
         Raises
         ------
         InputError
-            The whole file held no frame of the profile; says which shipped profile fits, if one does. A log
-            has several channels and none was chosen, or not the chosen one; names them.
+            The whole file held no frame of the profile; the message names the shipped profile that fits, if
+            one does. Or a log has several channels and none was chosen, or not the chosen one.
         """
+        self.tracker = SequenceTracker(self.layout)
         for frames in self._frames(advance):
             yield self.tracker.feed(frames)
-        frames = self._decoder.close()
-        self._check_channel()
-        yield self.tracker.feed(frames)
         if self.tracker.counts.frames == 0:
             raise InputError(
                 f"{self.path}: expected frames of {self.layout.name}, "
                 f"got none in {self.size} bytes{self._hint()}"
             )
 
-    def increments(self, compensator: Compensator, advance: Callable[[int], None]) -> Iterator[Records]:
-        """Decode and compensate the file, piece by piece.
+    def increments(self, compensator: Compensator, advance: Advance = _no_progress) -> Iterator[Records]:
+        """Decode and compensate the file from its beginning, piece by piece.
 
         Parameters
         ----------
         compensator : Compensator
-            For this layout.
-        advance : callable
-            Told the number of bytes read after each piece.
+            Compensation for this layout.
+        advance : callable, optional
+            Called with the number of bytes read after each piece.
 
         Yields
         ------
         ndarray of INCREMENTS
-            In order. Those of a recording bear the stamps that they had live; in a capture times count from
+            In order. Those of a recording have the stamps that they had live; in a capture times count from
             its beginning, and are flagged as not UNIX time.
+
+        Raises
+        ------
+        InputError
+            See `pulses`.
         """
         if self.recording is None:
             for pulses in self.pulses(advance):
@@ -143,21 +181,25 @@ class Capture:
             yield clock.stamp(compensator.feed(pulses))
         yield clock.stamp(compensator.close())
 
-    def _frames(self, advance: Callable[[int], None]) -> Iterator[Records]:
-        if isinstance(self._decoder, CaptureDecoder):
+    def _frames(self, advance: Advance) -> Iterator[Records]:
+        if self.recording is None:
+            self._decoder = decoder = CaptureDecoder(self.layout, self._channel)
             with self.path.open("rb") as file:
                 while data := file.read(CHUNK_BYTES):
-                    frames = self._decoder.feed(data)
+                    frames = decoder.feed(data)
                     self._check_channel()
                     yield frames
                     advance(len(data))
-            return
-        assert self.recording is not None
-        arrivals = self.recording.arrivals()
-        while some := list(islice(arrivals, READS_AT_ONCE)):
-            # Each read has its own time; the stages behind cost by the call.
-            yield np.concatenate([self._decoder.feed(arrival.data, arrival.t_ns) for arrival in some])
-            advance(sum(len(arrival.data) for arrival in some))
+        else:
+            self._decoder = reads = FrameDecoder(self.layout)
+            arrivals = self.recording.arrivals()
+            while some := list(islice(arrivals, READS_AT_ONCE)):
+                # Each read has its own time; the later stages cost by the call.
+                yield np.concatenate([reads.feed(arrival.data, arrival.t_ns) for arrival in some])
+                advance(sum(len(arrival.data) for arrival in some))
+        frames = self._decoder.close()
+        self._check_channel()
+        yield frames
 
     def _check_channel(self) -> None:
         if self._log is not None:
@@ -171,6 +213,65 @@ class Capture:
                 if layout.name != self.layout.name and len(decoder.feed(self._head)):
                     return f"; its beginning has frames of {name}: try --profile {name}"
         return "; is it the right file, and the right --profile?"
+
+
+def compensate(
+    capture: Capture | str | os.PathLike[str],
+    calibration: Calibration | str | os.PathLike[str] | None = None,
+    *,
+    profile: Profile | str | os.PathLike[str] | None = None,
+    rate_filter: RateFilterName = "causal",
+    advance: Advance = _no_progress,
+) -> Records:
+    """Compensate a whole capture or recording.
+
+    Parameters
+    ----------
+    capture : Capture or path-like
+        The capture; of a file with several channels a `Capture`.
+    calibration : Calibration or path-like, optional
+        Calibration of the unit; if absent that of the recording.
+    profile : Profile or path-like, optional
+        Wire format, for a path; see `Capture`.
+    rate_filter : {'causal', 'centred', 'dither'}
+        Filter of the angular rate for the size effect; see `imudrv.rate_filter`.
+    advance : callable, optional
+        Called with the number of bytes read after each piece.
+
+    Returns
+    -------
+    ndarray of INCREMENTS
+        One row a sample: ``counter``, ``t_ns``, ``interval_ns``, ``dtheta_b`` (rad), ``dv_b`` (m/s),
+        ``flags`` (`imudrv.Flag`).
+
+    Raises
+    ------
+    InputError
+        A file cannot be used, there is no calibration, or a `Capture` comes with another profile.
+
+    Examples
+    --------
+    >>> increments = imudrv.compensate("z_up.raw", calibration="unit.yaml", profile="imu50-rs422")
+    >>> increments.dtype.names
+    ('counter', 't_ns', 'interval_ns', 'dtheta_b', 'dv_b', 'flags')
+    >>> len(increments)
+    1000
+    """
+    if not isinstance(capture, Capture):
+        capture = Capture(capture, profile)
+    elif profile is not None:
+        raise InputError(f"{capture.path}: expected no profile beside a Capture, which has its own")
+    if calibration is None and capture.recording is not None:
+        calibration = capture.recording.calibration
+    if calibration is None:
+        raise InputError(f"{capture.path}: expected a calibration, for the file contains none; give one")
+    if not isinstance(calibration, Calibration):
+        calibration = read_calibration(calibration)
+    interval_ns = capture.layout.interval_ns
+    compensator = Compensator(
+        coefficients(calibration), capture.layout, make_filter(rate_filter, interval_ns)
+    )
+    return np.concatenate(list(capture.increments(compensator, advance)))
 
 
 def _unlocked(increments: Records) -> Records:

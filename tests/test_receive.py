@@ -12,7 +12,7 @@ import pytest
 
 from imudrv.errors import InputError
 from imudrv.ports.base import PortLostError
-from imudrv.receive import Receiver, receive
+from imudrv.receiver import Receiver, receive
 from imudrv.records import INCREMENTS, Records, Source
 from imudrv.wire.datagram import SIZE, encode
 

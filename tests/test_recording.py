@@ -9,55 +9,16 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
+from samples import CERTIFICATE, record
 
 from imudrv import profiles
 from imudrv.errors import FaultyFileError, InputError
 from imudrv.recording.format import pack_messages, unpack_messages
 from imudrv.recording.pack import pack
 from imudrv.recording.reader import Recording
-from imudrv.records import INCREMENTS, MESSAGE, PULSES, Arrival, Source
-from imudrv.sinks.base import Batch
-from imudrv.sinks.recorder import Recorder
-from imudrv.wire.datagram import encode
+from imudrv.records import MESSAGE, Arrival
 
 PROFILES = Path(profiles.__file__).parent
-CALIBRATION = b"""\
-format: imu50-calibration
-version: 1
-serial_number: "50-0017"
-created: 2026-11-22T10:00:00Z
-gyro:
-  scale_arcsec_per_pulse: [0.5, 0.5, 0.5]
-  bias_deg_per_h: [0.0, 0.0, 0.0]
-  C_bg: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
-accelerometer:
-  scale_pulse_per_m_s: [2000.0, 2000.0, 2000.0]
-  bias_ug: [0.0, 0.0, 0.0]
-  C_ba: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
-"""
-
-
-def record(path: Path, samples: int) -> None:
-    profile = "imu50-rs422"
-    recorder = Recorder(
-        path,
-        layout=profiles.load(profile).layout(),
-        profile=(PROFILES / f"{profile}.yaml").read_bytes(),
-        calibration=CALIBRATION,
-        source=Source.SIMULATOR,
-        port="sim://x.yaml",
-        unit="50-0017",
-    )
-    for n in range(samples):
-        increments = np.zeros(1, INCREMENTS)
-        increments["counter"], increments["interval_ns"] = n, 1_000_000
-        increments["flags"] = 1
-        recorder.arrived(Arrival(1000 + n, b"%044d" % n))
-        recorder.publish(Batch(np.zeros(1, PULSES), increments, encode(increments, Source.SIMULATOR)))
-    recorder.status({"rate_hz": 1000.0})
-    recorder.event(5000, "unplugged")
-    recorder.calibration(6000, CALIBRATION.replace(b"0.5, 0.5, 0.5", b"0.6, 0.6, 0.6"))
-    recorder.close()
 
 
 @pytest.fixture(scope="session")
@@ -94,7 +55,7 @@ def test_everything_that_was_recorded_comes_back(recorded: Path) -> None:
     assert recording.profile == profiles.load("imu50-rs422")
     assert recording.calibration is not None
     assert recording.calibration.serial_number == "50-0017"
-    assert recording.calibration_text == CALIBRATION.decode()
+    assert recording.calibration_text == CERTIFICATE
     assert recording.origin["port"] == "sim://x.yaml"
     assert recording.origin["version"] == "0.1.0"
     arrivals, increments, statuses, events, calibrations = contents(recording)

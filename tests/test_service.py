@@ -27,7 +27,7 @@ from imudrv.calibration import write_calibration
 from imudrv.errors import InputError
 from imudrv.hostclock import now_ns
 from imudrv.profiles import load
-from imudrv.receive import receive
+from imudrv.receiver import receive
 from imudrv.recording.reader import Recording
 from imudrv.records import PULSES, Flag
 from imudrv.service.loop import Service as Driver

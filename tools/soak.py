@@ -44,7 +44,7 @@ from imudrv.capture import Capture
 from imudrv.errors import InputError
 from imudrv.files.tables import increment_columns
 from imudrv.imu.sequence import SampleCounts
-from imudrv.receive import receive
+from imudrv.receiver import receive
 from imudrv.recording.reader import Recording
 from imudrv.records import INCREMENTS, PULSES, Flag, Records
 from imudrv.service.status_socket import ask

@@ -1,8 +1,9 @@
-"""Profiles: a unit's wire format as data. Four come with the package; a user's own is read by path.
+"""Profiles: wire formats of units as data. Four come with the package; a user's own is read by its path.
 
-A profile is checked completely before it is used, and becomes a `Layout` for the decoder.
+schema  the profile file, checked completely, and its translation into the decoder's `Layout`
 """
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import resources
@@ -20,12 +21,12 @@ def shipped() -> list[str]:
     )
 
 
-def load(name_or_path: str) -> Profile:
+def load(name_or_path: str | os.PathLike[str]) -> Profile:
     """Read a profile, by the name of a shipped one or by the path of a file.
 
     Parameters
     ----------
-    name_or_path : str
+    name_or_path : path-like
         ``imu50-rs422``, or ``my/unit.yaml``.
 
     Returns
@@ -41,28 +42,28 @@ def load(name_or_path: str) -> Profile:
     return load_file(name_or_path).model
 
 
-def load_file(name_or_path: str) -> SettingsFile[Profile]:
-    """A profile with the content of its file; see `load`."""
+def load_file(name_or_path: str | os.PathLike[str]) -> SettingsFile[Profile]:
+    """Read a profile together with the content of its file; see `load`."""
     with _file(name_or_path) as path:
         return read_file(path, Profile)
 
 
-def content(name_or_path: str) -> bytes:
-    """Content of a profile's file; see `load`."""
+def content(name_or_path: str | os.PathLike[str]) -> bytes:
+    """Return the content of a profile's file; see `load`."""
     with _file(name_or_path) as path:
         return path.read_bytes()
 
 
 @contextmanager
-def _file(name_or_path: str) -> Iterator[Path]:
-    if name_or_path in shipped():
-        with resources.as_file(resources.files(__name__) / f"{name_or_path}.yaml") as path:
+def _file(name_or_path: str | os.PathLike[str]) -> Iterator[Path]:
+    name = os.fspath(name_or_path)
+    if name in shipped():
+        with resources.as_file(resources.files(__name__) / f"{name}.yaml") as path:
             yield path
         return
-    path = Path(name_or_path)
-    if not path.exists():
+    if not Path(name).exists():
         raise InputError(
-            f"profile {name_or_path!r}: expected one of {', '.join(shipped())}, "
+            f"profile {name!r}: expected one of {', '.join(shipped())}, "
             "or the path of a profile file; there is no such file"
         )
-    yield path
+    yield Path(name)

@@ -15,6 +15,7 @@ was swapped in later is attached again at its time. The metadata record ``imu50`
 """
 
 import json
+import os
 import struct
 import zlib
 from collections.abc import Callable, Iterator
@@ -89,17 +90,31 @@ class Recording:
 
     Parameters
     ----------
-    path : Path
+    path : path-like
         The file.
+
+    Attributes
+    ----------
+    path : Path
+    cut : bool
+        Whether the end is absent.
 
     Raises
     ------
     InputError
-        It cannot be read, or is no MCAP file.
+        The file cannot be read, or is no MCAP file.
+
+    Examples
+    --------
+    >>> recording = imudrv.Recording("run.mcap")
+    >>> recording
+    <Recording run.mcap, imu50-rs422, complete>
+    >>> np.concatenate(list(recording.increments()))["dtheta_b"].shape
+    (30, 3)
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = path = Path(path)
         try:
             with path.open("rb") as file:
                 head = file.read(len(MCAP0_MAGIC))
@@ -108,6 +123,13 @@ class Recording:
             raise InputError(f"{path}: expected a recording, cannot read it: {error.strerror}") from error
         if not MCAP0_MAGIC.startswith(head):
             raise InputError(f"{path}: expected a recording (MCAP), got another kind of file")
+
+    def __repr__(self) -> str:
+        try:
+            profile = self.profile.name
+        except InputError:
+            profile = "no profile"
+        return f"<Recording {self.path}, {profile}, {'cut' if self.cut else 'complete'}>"
 
     @property
     def profile_text(self) -> str:

@@ -1,0 +1,106 @@
+"""The public names of `imudrv`, as in a notebook: the examples of the docstrings, on a simulated capture."""
+
+import doctest
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from samples import record
+
+import imudrv
+import imudrv.capture
+import imudrv.recording.reader
+from imudrv.calibration import write_calibration
+from imudrv.cli import main
+from imudrv.sim.scenario import NOMINAL
+
+SCENARIO = """
+format: imu50-scenario
+version: 1
+seed: 5
+site: {latitude_deg: 28.2, longitude_deg: 113.0, height_m: 60.0}
+motion: [{rest: {duration_s: 1.0}}]
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("notebook")
+    (folder / "rest.yaml").write_text(SCENARIO)
+    capture = ["-o", str(folder / "z_up.raw")]
+    assert main(["sim", str(folder / "rest.yaml"), "--profile", "imu50-rs422", *capture]) == 0
+    write_calibration(folder / "unit.yaml", NOMINAL)
+    record(folder / "run.mcap", 30)
+    return folder
+
+
+@pytest.fixture
+def here(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(folder)
+    return folder
+
+
+@pytest.mark.parametrize("name", ["imudrv", "imudrv.capture", "imudrv.recording.reader"])
+def test_the_examples_of_the_docstrings_are_true(here: Path, name: str) -> None:
+    names = {"imudrv": imudrv, "np": np}
+    failed, tried = doctest.testmod(sys.modules[name], extraglobs=names)
+    assert tried > 0
+    assert failed == 0
+
+
+def test_importing_the_package_loads_no_large_library_and_the_calibration_no_kernel() -> None:
+    code = (
+        "import sys, imudrv; assert not {'numba', 'numpy', 'pydantic'} & set(sys.modules), 'imudrv'; "
+        "import imudrv.calibration; assert 'numba' not in sys.modules, 'imudrv.calibration'"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=300)
+
+
+def test_every_public_name_is_there_and_no_other_is_listed() -> None:
+    code = (
+        "import imudrv, imudrv.cli; from imudrv import *; "
+        "assert dir(imudrv) == sorted(imudrv.__all__); "
+        "assert {type(getattr(imudrv, name)).__name__ for name in dir(imudrv)}.isdisjoint({'module'})"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=300)
+    with pytest.raises(AttributeError, match="'imudrv' has no attribute 'Captur'"):
+        _ = imudrv.Captur  # type: ignore[attr-defined]
+
+
+def test_increments_are_those_of_the_stages_one_by_one(here: Path) -> None:
+    profile = imudrv.load_profile("imu50-rs422")
+    capture = imudrv.Capture(here / "z_up.raw", profile)
+    layout = capture.layout
+    compensator = imudrv.Compensator(
+        imudrv.coefficients(imudrv.read_calibration("unit.yaml")),
+        layout,
+        imudrv.rate_filter("centred", layout.interval_ns),
+    )
+    expected = np.concatenate(list(capture.increments(compensator)))
+    for given in (capture, "z_up.raw"):  # a capture can be read again, from its beginning
+        more = {"profile": profile} if given == "z_up.raw" else {}
+        got = imudrv.compensate(given, "unit.yaml", rate_filter="centred", **more)  # type: ignore[arg-type]
+        np.testing.assert_array_equal(got, expected)
+    assert capture.tracker.counts.frames == 1000
+
+
+def test_progress_is_the_number_of_bytes_read(here: Path) -> None:
+    read: list[int] = []
+    imudrv.compensate("z_up.raw", NOMINAL, profile="imu50-rs422", advance=read.append)
+    assert sum(read) == Path("z_up.raw").stat().st_size
+
+
+def test_a_missing_calibration_or_a_second_profile_is_an_error_that_says_what_to_do(here: Path) -> None:
+    capture = imudrv.Capture("z_up.raw", "imu50-rs422")
+    with pytest.raises(imudrv.InputError, match="expected a calibration, for the file contains none; give"):
+        imudrv.compensate(capture)
+    with pytest.raises(imudrv.InputError, match="no profile beside a Capture"):
+        imudrv.compensate(capture, "unit.yaml", profile="imu50-can")
+
+
+def test_a_recording_that_was_cut_before_its_profile_has_a_repr(here: Path, tmp_path: Path) -> None:
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(Path("run.mcap").read_bytes()[:10])
+    assert repr(imudrv.Recording(str(cut))) == f"<Recording {cut}, no profile, cut>"
