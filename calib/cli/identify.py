@@ -5,8 +5,6 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Final, get_args
 
-from rich.console import Console
-
 from calib.certificate import certificate, check_target, write
 from calib.cli.arguments import (
     KnownPoint,
@@ -20,7 +18,8 @@ from calib.cli.arguments import (
 from calib.estimation.result import Extra
 from calib.identification import PriorCalibration, identify_captures
 from calib.lever_arms.gauge import Gauge, LeverArms, convert
-from calib.reports.identification import report_for_terminal, report_html, report_text
+from calib.reports.identification import document, report_html
+from calib.reports.text import print_document
 from calib.result_file import result_document, write_json
 from imudrv import profiles
 from imudrv.calibration import Calibration, read_calibration_file, require_unit
@@ -110,11 +109,7 @@ def run(arguments: argparse.Namespace) -> None:
         write(arguments.output, certificate(result, arms))
         written.append(written_text(arguments.output, prior.calibration, arms))
     finally:
-        console = Console(highlight=False)
-        if console.is_terminal:
-            console.print(report_for_terminal(result, gauges))
-        else:
-            print(report_text(result, gauges), end="")
+        print_document(document(result, gauges))
         print(*written, sep="\n")
 
 

@@ -11,7 +11,7 @@ from rich.console import Console
 from calib.certificate import lever_arms_of
 from calib.cli.arguments import add_channel, check_output
 from calib.reports.html import as_html
-from calib.reports.text import as_text, for_terminal
+from calib.reports.text import print_document
 from calib.reports.validation import document
 from calib.validation.navigate import navigate
 from calib.validation.simulate import TRIALS, campaign, dither_trials, skew_trials
@@ -75,11 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.report is not None:
         with atomic_write(arguments.report) as file:
             file.write(as_html(report).encode())
-    console = Console(highlight=False)
-    if console.is_terminal:
-        console.print(for_terminal(report))
-    else:
-        print(as_text(report), end="")
+    print_document(report)
     return OK if all(metrics.good for metrics in required) else NOT_GOOD
 
 
