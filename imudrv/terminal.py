@@ -67,7 +67,8 @@ class _Version(argparse.Action):
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
         from importlib.metadata import version
 
-        parser.exit(message=f"{parser.prog} {version('imu50')}\n")
+        sys.stdout.write(f"{parser.prog} {version('imu50')}\n")
+        parser.exit()
 
 
 def guarded(command: Callable[[], int | None]) -> int:
