@@ -3,17 +3,18 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from io import BytesIO
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from calib.estimation.result import RunResult
 from calib.estimation.runs import Run
 from imudrv.arrays import Array
 from imudrv.units import MM
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 WIDTH_IN: Final = 7.0
 
@@ -50,15 +51,18 @@ _STYLE: Final[dict[Any, Any]] = {
 class _Canvas:
     """A figure, and its SVG once it is complete."""
 
-    def __init__(self, height_in: float) -> None:
-        self.figure = Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
+    def __init__(self, figure: "Figure") -> None:
+        self.figure = figure
         self.svg = b""
 
 
 @contextmanager
 def _canvas(height_in: float) -> Iterator[_Canvas]:
-    with mpl.rc_context(_STYLE):
-        canvas = _Canvas(height_in)
+    from matplotlib import rc_context  # slow to import; not needed for text
+    from matplotlib.figure import Figure
+
+    with rc_context(_STYLE):
+        canvas = _Canvas(Figure(figsize=(WIDTH_IN, height_in), layout="constrained"))
         yield canvas
         out = BytesIO()
         canvas.figure.savefig(out, format="svg", metadata={"Date": None})
