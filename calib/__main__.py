@@ -2,6 +2,6 @@
 
 import sys
 
-from calib.cli.main import main
+from calib.cli import main
 
 sys.exit(main())

@@ -1,16 +1,12 @@
-"""What every command shares: errors in plain words, exit codes, and a progress bar where somebody looks."""
+"""Command lines: commands loaded when called, error messages, exit codes, progress bar."""
 
 import argparse
 import os
 import sys
 import time
-import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import TypeAlias
-
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from importlib import import_module
 
 from imudrv.errors import InputError
 
@@ -21,101 +17,132 @@ OK, OUR_FAULT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 _PATIENCE_S = 1.0
 
 
-Command: TypeAlias = Callable[[argparse.Namespace], int | None]
+def run_program(
+    package: str, description: str, commands: Mapping[str, str], argv: Sequence[str] | None
+) -> int:
+    """Run a program whose commands are modules of a package.
 
-
-class CommandLine:
-    """A program with commands, each a function of its arguments.
-
-    Parameters
-    ----------
-    program, description : str
-        As help tells them.
-    """
-
-    def __init__(self, program: str, description: str) -> None:
-        self._parser = argparse.ArgumentParser(prog=program, description=description)
-        self._commands = self._parser.add_subparsers(required=True, metavar="COMMAND")
-
-    def add(self, name: str, command: Command, text: str) -> argparse.ArgumentParser:
-        """Add a command; gives the parser that its arguments are added to."""
-        parser = self._commands.add_parser(name, help=text, description=text)
-        parser.set_defaults(command=command)
-        return parser
-
-    def run(self, argv: Sequence[str] | None) -> int:
-        """Run the command that the arguments name, those of the process if None; gives the exit code."""
-        arguments = self._parser.parse_args(argv)
-        command: Command = arguments.command
-        return guarded(lambda: command(arguments))
-
-
-def guarded(command: Callable[[], int | None]) -> int:
-    """Run a command; what goes wrong becomes one message and an exit code.
+    Module ``new_thing`` of the package is the command ``new-thing``: ``add_arguments(parser)`` declares its
+    arguments, ``run(arguments)`` does the work and may return an exit code, ``EXAMPLE`` is shown by its help.
+    Only the module of the command that is called is imported, so that help costs no numerical library.
 
     Parameters
     ----------
-    command : callable
-        The work; an exit code of its own goes before 0.
+    package : str
+        Name of the package, such as ``imudrv.cli``; its first part is the name of the program.
+    description : str
+        What the program does, for its help.
+    commands : mapping of str to str
+        What each command does, by its name.
+    argv : sequence of str or None
+        Arguments; those of the process if None.
 
     Returns
     -------
     int
-        0; 2 for what the user gave; 130 after Ctrl-C; 1 for a defect of ours, with the place of it.
+        Exit code, see `guarded`.
     """
-    console = Console(stderr=True, highlight=False, soft_wrap=True)
+    arguments = sys.argv[1:] if argv is None else argv
+    name = next((argument for argument in arguments if not argument.startswith("-")), None)
+    program = package.partition(".")[0]
+    parser = argparse.ArgumentParser(
+        prog=program, description=description, epilog=f"example: {program} {next(iter(commands))} --help"
+    )
+    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
+    subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
+    module = None
+    for command, text in commands.items():
+        subparser = subparsers.add_parser(command, help=text, description=text)
+        if command == name:
+            module = import_module(f"{package}.{command.replace('-', '_')}")
+            subparser.epilog = f"example: {program} {command} {module.EXAMPLE}".rstrip()
+            module.add_arguments(subparser)
+    parsed = parser.parse_args(arguments)
+    return guarded(lambda: module.run(parsed) if module else None)
+
+
+class _Version(argparse.Action):
+    """Prints the version; looked up only when asked for."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from importlib.metadata import version
+
+        sys.stdout.write(f"{parser.prog} {version('imu50')}\n")
+        parser.exit()
+
+
+def guarded(command: Callable[[], int | None]) -> int:
+    """Run a command; an error becomes one message and an exit code.
+
+    Parameters
+    ----------
+    command : callable
+        The work; may return an exit code.
+
+    Returns
+    -------
+    int
+        The command's exit code, 0 if it has none; 2 for an error of the user; 130 after Ctrl-C; 1 for a
+        defect of this product, reported with its place in the code.
+    """
     try:
         code = command()
-        if sys.stdout is not None:  # as it is in a process that was started with it closed
+        if sys.stdout is not None:  # None: the process was started with it closed
             sys.stdout.flush()
     except InputError as error:
-        console.print(f"error: {error}", markup=False)
+        _complain(f"error: {error}")
         return BAD_INPUT
     except KeyboardInterrupt:
-        console.print("interrupted")
+        _complain("interrupted")
         return INTERRUPTED
     except BrokenPipeError:
-        # The reader of our output has left, as `head` does; Python must not try to flush it again at exit.
+        # The reader of the output has gone, as `head` does; Python must not flush it again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK
     except Exception as error:
-        console.print(f"internal error, please report it: {type(error).__name__}: {error}", markup=False)
-        console.print("".join(traceback.format_tb(error.__traceback__)[-2:]), markup=False)
+        from traceback import format_tb
+
+        place = "".join(format_tb(error.__traceback__)[-2:])
+        _complain(f"internal error, please report it: {type(error).__name__}: {error}\n{place}")
         return OUR_FAULT
     return code or OK
 
 
+def _complain(text: str) -> None:
+    if sys.stderr is not None:
+        sys.stderr.write(f"{text}\n")
+
+
 @contextmanager
 def progress(title: str, total: int) -> Iterator[Callable[[int], None]]:
-    """A bar on a terminal for what takes longer than a second; elsewhere nothing.
+    """Show a progress bar on a terminal once the work has taken a second; elsewhere nothing.
 
     Parameters
     ----------
     title : str
-        What is going on.
+        Name of the work.
     total : int
-        How much there is.
+        Amount of work, in any unit.
 
     Yields
     ------
     callable
-        To be told how much more is done.
+        Called with the amount done since the last call.
     """
-    console = Console(stderr=True)
-    bar = Progress(
-        TextColumn(title),
-        BarColumn(),
-        TaskProgressColumn(),
-        TimeRemainingColumn(),
-        console=console,
-        transient=True,
-    )
+    if sys.stderr is None or not sys.stderr.isatty():
+        yield lambda amount: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+    columns = TextColumn(title), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
+    bar = Progress(*columns, console=Console(stderr=True), transient=True)
     task = bar.add_task(title, total=total)
     begun = time.monotonic()
 
     def advance(amount: int) -> None:
         bar.advance(task, amount)
-        if not bar.live.is_started and console.is_terminal and time.monotonic() - begun > _PATIENCE_S:
+        if not bar.live.is_started and time.monotonic() - begun > _PATIENCE_S:
             bar.start()
 
     try:

@@ -1,7 +1,9 @@
 """The commands as a user runs them: real processes, real files, exit codes and messages."""
 
+import argparse
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -9,12 +11,16 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from hashlib import sha256
+from importlib import import_module
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 import pytest
 from samples import CERTIFICATE
 
+from calib import cli as calib
+from imudrv import cli
 from imudrv.cli import main
 from imudrv.wire.datagram import DatagramDecoder
 
@@ -240,3 +246,53 @@ def test_real_laser_gyro_pulses_come_through_the_wire_as_they_are(data: Path, tm
         rate_deg_per_h = np.linalg.norm(quiet.sum(axis=0)) / (len(quiet) * 0.01) * 3600.0
     # Earth rate is 15.04 deg/h; data/README.md gives 14.85 for this log, to the digits shown.
     assert rate_deg_per_h == pytest.approx(14.85, abs=0.005)
+
+
+HEAVY = {"numpy", "numba", "scipy", "pydantic", "rich", "yaml", "matplotlib"}
+
+
+@pytest.mark.parametrize(
+    ("program", "arguments", "code"),
+    [
+        ("imudrv", ["--help"], 0),
+        ("imudrv", ["--version"], 0),
+        ("imudrv", ["status", "--status", "absent.sock"], 2),
+        ("imudrv", ["monitr"], 2),
+        ("calib", ["--help"], 0),
+        ("calib", ["--version"], 0),
+    ],
+)
+def test_help_version_and_status_load_no_numerical_library(
+    program: str, arguments: list[str], code: int, tmp_path: Path
+) -> None:
+    command = [sys.executable, "-X", "importtime", "-m", program, *arguments]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == code
+    loaded = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
+    assert f"{program}.cli" in loaded
+    assert not loaded & HEAVY
+
+
+@pytest.mark.parametrize(
+    ("main", "commands"), [(main, cli.COMMANDS), (calib.main, calib.COMMANDS)], ids=["imudrv", "calib"]
+)
+def test_the_help_of_every_command_has_an_example_that_it_accepts(
+    main: Callable[[list[str]], int], commands: dict[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in commands:
+        with pytest.raises(SystemExit) as end:
+            main([name, "--help"])
+        assert end.value.code == 0
+        text = " ".join(capsys.readouterr().out.split())
+        program, command, *example = shlex.split(text.rpartition("example: ")[2].partition(" > ")[0])
+        assert (program, command) == (main.__module__.partition(".")[0], name)
+        parser = argparse.ArgumentParser()
+        import_module(f"{main.__module__}.{name.replace('-', '_')}").add_arguments(parser)
+        parser.parse_args(example)
+
+
+def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["--version"])
+    assert end.value.code == 0
+    assert capsys.readouterr().out == f"imudrv {version('imu50')}\n"

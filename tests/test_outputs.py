@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from calib.cli.main import main as calib
+from calib.cli import main as calib
 from imudrv.calibration import read_calibration, write_calibration
 from imudrv.cli import main as imudrv
 from imudrv.errors import InputError

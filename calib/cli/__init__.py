@@ -1,1 +1,25 @@
-"""The command `calib`: one module a group of commands."""
+"""The command `calib`: each module is the command of its name; `arguments` is shared.
+
+A module is imported when its command is called, see `imudrv.terminal.run_program`.
+"""
+
+from collections.abc import Sequence
+from typing import Final
+
+from imudrv.terminal import run_program
+
+COMMANDS: Final = {
+    "run": "Run the bench procedure with a unit: from the first pose to its new certificate.",
+    "verify": "Check the files of a session, and compute its result again from the recordings.",
+    "identify": "Identify lever arms from captures of rotations: certificate and report.",
+    "validate": "Navigate the same pulses with and without compensation; exit code 3 if a verdict is bad.",
+    "gauge": "Convert the lever arms of a certificate to another gauge, exactly, with their covariance.",
+    "export-arms": "Print the lever arms of a certificate in the format of another program.",
+    "import-arms": "Write lever arms of another program to a certificate.",
+    "dither": "Predict what gyro dither adds to the accelerometers, and what each rate filter compensates.",
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run `calib` with some arguments, those of the process if None; return the exit code."""
+    return run_program(__name__, "Inner lever arms of a 50-type ring-laser-gyro IMU.", COMMANDS, argv)

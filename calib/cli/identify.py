@@ -1,29 +1,79 @@
 """Command `calib identify`."""
 
 import argparse
-
-from rich.console import Console
+from pathlib import Path
+from typing import Final, get_args
 
 from calib.certificate import certificate, check_target, write
-from calib.cli.arguments import Stated, check_output, known_point, written_text
+from calib.cli.arguments import (
+    KnownPoint,
+    add_certificate_output,
+    add_channel,
+    add_gauge,
+    check_output,
+    known_point,
+    written_text,
+)
+from calib.estimation.result import Extra
 from calib.identification import EstimationOptions, identify, prior_calibration
 from calib.lever_arms.gauge import Gauge, LeverArms, convert
-from calib.reports.identification import report_for_terminal, report_html, report_text
+from calib.reports.identification import document, report_html
+from calib.reports.text import print_document
 from calib.result_file import result_document, write_json
+from imudrv.cli.arguments import add_profile
 from imudrv.errors import InputError
 from imudrv.files.atomic import atomic_write
 from imudrv.terminal import progress
 
+EXAMPLE: Final = (
+    "z-up.raw x-up.raw y-up.raw --profile imu50-rs422 --calibration unit.yaml --site site.yaml -o new.yaml"
+)
 
-def run_identify(arguments: argparse.Namespace) -> None:
-    """Run the command."""
-    stated = known_point(arguments.at)
+_EXTRAS: Final[tuple[Extra, ...]] = get_args(Extra)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    add = parser.add_argument
+    text = "wire bytes, candump logs, or recordings (.mcap), which contain their profile"
+    add("captures", type=Path, nargs="+", metavar="CAPTURE", help=text)
+    add_profile(parser)
+    add_channel(parser)
+    text = "calibration of the unit; default: the one in the recordings"
+    add("--calibration", type=Path, metavar="C.yaml", help=text)
+    text = "site of the captures: latitude, longitude, height"
+    add("--site", type=Path, required=True, metavar="S.yaml", help=text)
+    text = "serial number of the unit; the calibration of another unit is rejected"
+    add("--unit", metavar="SERIAL", help=text)
+    add("--method", choices=("joint", "plain"), default="joint", help="default: joint")
+    add_gauge(parser, "--gauge")
+    text = (
+        "fixed: the origin of the body frame does not move, as on a turntable; determines all nine components"
+    )
+    add("--pivot", choices=("free", "fixed"), default="free", help=text)
+    text = f"estimate more parameters: {','.join(_EXTRAS)}"
+    add("--estimate", type=_extra_parameters, default=(), metavar="NAMES", help=text)
+    add_certificate_output(parser)
+    add("--json", type=Path, metavar="R.json", help="the whole result as JSON")
+    add("--report", type=Path, metavar="R.html", help="report with figures, one file")
+
+
+def _extra_parameters(text: str) -> tuple[Extra, ...]:
+    names = tuple(text.split(","))
+    if unknown := [name for name in names if name not in _EXTRAS]:
+        raise argparse.ArgumentTypeError(f"expected {' or '.join(_EXTRAS)}, got {unknown[0]!r}")
+    return tuple(name for name in _EXTRAS if name in names)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Identify the lever arms from captures."""
+    point = known_point(arguments.at)
     inputs = (*arguments.captures, arguments.profile, arguments.calibration, arguments.site)
     for output in filter(None, (arguments.output, arguments.json, arguments.report)):
         check_output(output, *inputs)
     prior = prior_calibration(arguments.captures, arguments.calibration, arguments.unit)
     check_target(arguments.output, prior.calibration)
-    nine = arguments.gauge == "given" and stated is None
+    nine = arguments.gauge == "given" and point is None
     size = sum(path.stat().st_size for path in arguments.captures if path.exists())
     with progress("identify", 2 * size) as advance:  # each capture is read twice
         result = identify(
@@ -35,32 +85,28 @@ def run_identify(arguments: argparse.Namespace) -> None:
             channel=arguments.channel,
             advance=advance,
         )
-    arms = _wanted(result.arms, arguments.gauge, stated)
-    shown = (arms, convert(arms, "x" if arms.gauge == "centroid" else "centroid"))
+    arms = _in_gauge(result.arms, arguments.gauge, point)
+    gauges = (arms, convert(arms, "x" if arms.gauge == "centroid" else "centroid"))
     written = []
-    try:  # files first: whoever reads the text may leave
+    try:  # files first: the reader of the text may go away
         if arguments.json is not None:
             write_json(arguments.json, result_document(result, arms))
             written.append(f"{arguments.json}: the result")
         if arguments.report is not None:
             with atomic_write(arguments.report) as file:
-                file.write(report_html(result, shown).encode())
+                file.write(report_html(result, gauges).encode())
             written.append(f"{arguments.report}: the report")
         write(arguments.output, certificate(result, arms))
         written.append(written_text(arguments.output, prior.calibration, arms))
     finally:
-        console = Console(highlight=False)
-        if console.is_terminal:
-            console.print(report_for_terminal(result, shown))
-        else:
-            print(report_text(result, shown), end="")
+        print_document(document(result, gauges))
         print(*written, sep="\n")
 
 
-def _wanted(arms: LeverArms, gauge: Gauge | None, stated: Stated | None) -> LeverArms:
-    """Return the arms in the requested gauge, by default in that of the estimate."""
-    if stated is None and gauge in (None, arms.gauge):
+def _in_gauge(arms: LeverArms, gauge: Gauge | None, point: KnownPoint | None) -> LeverArms:
+    """Return the arms in the requested gauge, by default that of the estimate."""
+    if point is None and gauge in (None, arms.gauge):
         return arms
     if gauge is None:
         raise InputError("--at: expected with --gauge given")
-    return convert(arms, gauge, stated)
+    return convert(arms, gauge, point)

@@ -3,30 +3,57 @@
 import argparse
 from collections.abc import Iterator
 from contextlib import nullcontext
+from pathlib import Path
 from typing import Final
 
 from rich.console import Console
 
 from calib.api import validate
 from calib.certificate import lever_arms_of
-from calib.cli.arguments import check_output
+from calib.cli.arguments import add_channel, check_output
 from calib.reports.html import as_html
-from calib.reports.text import as_text, for_terminal
+from calib.reports.text import print_document
 from calib.reports.validation import document
 from calib.validation.simulate import TRIALS, campaign, dither_trials, skew_trials
-from calib.validation.trial import Trial
+from calib.validation.trial import RATE_FILTER, Trial
 from calib.validation.verdict import TrialMetrics, evaluate
 from imudrv.calibration import Calibration, read_calibration
+from imudrv.cli.arguments import add_profile
 from imudrv.errors import InputError
 from imudrv.files.atomic import atomic_write
+from imudrv.imu.rate_filter import NAMES
+from imudrv.nav.alignment import ALIGNMENT_S
 from imudrv.terminal import OK, progress
+
+EXAMPLE: Final = "--simulate rocking --seeds 20 --report validation.html"
 
 NOT_GOOD: Final = 3
 """Exit code: a verdict is bad."""
 
 
-def run_validate(arguments: argparse.Namespace) -> int:
-    """Judge recordings, or simulated units."""
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    add = parser.add_argument
+    text = "rest, motion, rest: wire bytes, candump logs, or recordings (.mcap)"
+    add("recordings", type=Path, nargs="*", metavar="RECORDING", help=text)
+    text = "simulate units, with lever arms from a simulated procedure"
+    add("--simulate", choices=(*TRIALS, "all"), help=text)
+    add("--seeds", type=int, default=1, metavar="N", help="number of simulated units (default: 1)")
+    add_profile(parser)
+    add_channel(parser)
+    add("--calibration", type=Path, metavar="C.yaml", help="calibration of the unit, with lever arms")
+    add("--site", type=Path, metavar="S.yaml", help="site of the recordings: latitude, longitude, height")
+    text = "length of the alignment in recordings (default: %(default)g s)"
+    add("--align", type=float, default=ALIGNMENT_S, metavar="S", help=text)
+    text = "angular rate for the size effect (default: %(default)s)"
+    add("--rate-filter", choices=NAMES, default=RATE_FILTER, help=text)
+    text = "time by which accelerometer samples of the recordings end later than those of gyros; is corrected"
+    add("--skew-ms", type=float, default=0.0, metavar="MS", help=text)
+    add("--report", type=Path, metavar="R.html", help="report with figures, one file")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Evaluate compensation on recordings, or on simulated units."""
     if (arguments.simulate is None) == (not arguments.recordings):
         raise InputError("validate: expected either recordings or --simulate")
     if arguments.report is not None:
@@ -35,21 +62,17 @@ def run_validate(arguments: argparse.Namespace) -> int:
     if arguments.simulate is not None:
         trials = [(trial, evaluate(trial)) for trial in _simulated(arguments)]
         shown = sum(trial.name.endswith("unit 1") for trial, _ in trials)
-        told = document("a simulated unit", trials, shown)
-        required = [judged for trial, judged in trials if "unit" in trial.name]
+        report = document("a simulated unit", trials, shown)
+        required = [metrics for trial, metrics in trials if "unit" in trial.name]
     else:
         calibration, trials = _navigated(arguments)
-        told = document(f"unit {calibration.serial_number}", trials, len(trials))
-        required = [judged for _, judged in trials]
+        report = document(f"unit {calibration.serial_number}", trials, len(trials))
+        required = [metrics for _, metrics in trials]
     if arguments.report is not None:
         with atomic_write(arguments.report) as file:
-            file.write(as_html(told).encode())
-    console = Console(highlight=False)
-    if console.is_terminal:
-        console.print(for_terminal(told))
-    else:
-        print(as_text(told), end="")
-    return OK if all(judged.good for judged in required) else NOT_GOOD
+            file.write(as_html(report).encode())
+    print_document(report)
+    return OK if all(metrics.good for metrics in required) else NOT_GOOD
 
 
 def _simulated(arguments: argparse.Namespace) -> Iterator[Trial]:

@@ -1,1 +1,5 @@
-"""Effect of the gyro dither on the accelerometers."""
+"""Effect of the gyro dither on the accelerometers.
+
+spectrum  closed form, line by line
+text      the effect as text
+"""

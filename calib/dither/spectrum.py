@@ -1,11 +1,11 @@
-"""What dithering gyros make accelerometers feel that sense at different points: closed form, line by line.
+"""Specific force that gyro dither causes in accelerometers at different points: closed form, line by line.
 
 Gyro j dithers about u_j with the angle a_j sin(W_j t + phi_j), so with the rate A_j cos(W_j t + phi_j),
 A_j = a_j W_j:
 
     omega = sum_j u_j A_j cos psi_j,   omega_dot = - sum_j u_j A_j W_j sin psi_j,   psi_j = W_j t + phi_j
 
-Accelerometer i, along a_i at r_i, feels f_i = a_i . ([omega_dot x] + [omega x]^2) r_i (mathematics, section
+Accelerometer i, along a_i at r_i, senses f_i = a_i . ([omega_dot x] + [omega x]^2) r_i (mathematics, section
 1). With a . (d x r) = d . (r x a), with [w x]^2 r = w (w . r) - r (w . w), and with
 
     T_ij = (r_i x a_i) . u_j
@@ -17,33 +17,34 @@ the products of cosines become sums, and
           + sum_j 1/2 A_j^2 Q_ijj (1 + cos 2 psi_j)                           mean and 2 W_j: centripetal
           + sum_j<k A_j A_k Q_ijk [cos(psi_j - psi_k) + cos(psi_j + psi_k)]   W_j -+ W_k: between gyros
 
-The literature's equations 2 to 4 are this for aligned axes. One gyro, about x (u = x, A_x = A):
+For aligned axes these are equations 2 to 4 of the literature. One gyro, about x (u = x, A_x = A):
 
     f_x = 0
     f_y = - A^2 cos^2(W t) r_yy + A W sin(W t) r_yz
     f_z = - A^2 cos^2(W t) r_zz - A W sin(W t) r_zy
 
-of mean - A^2/2 times the arm along the accelerometer; three gyros of three frequencies, the accelerometer x:
+with the mean - A^2/2 times the arm along the accelerometer. Three gyros of different frequencies,
+accelerometer x:
 
     mean of f_x = - 1/2 (A_y^2 + A_z^2) r_xx
 
-Gyros of one frequency add to the mean by their phases: A_j A_k Q_ijk cos(phi_j - phi_k).
+Two gyros of the same frequency add A_j A_k Q_ijk cos(phi_j - phi_k) to the mean.
 
-**Sampling.** An increment is the mean over the interval tau: a line at nu keeps sinc(nu tau) =
-sin(pi nu tau) / (pi nu tau) of itself. Increments come at the rate F = 1 / tau, so that nu is seen at
-|nu - m F|, m the nearest whole number; at 1 kHz 400 Hz stays, 800 Hz is seen at 200 Hz with 0.23 of its size.
+**Sampling.** An increment is the mean over the interval tau: a line at nu is multiplied by
+sinc(nu tau) = sin(pi nu tau) / (pi nu tau). The sample rate is F = 1 / tau, so nu is aliased to |nu - m F|, m
+the nearest integer; at 1 kHz, 400 Hz remains and 800 Hz is aliased to 200 Hz with 0.23 of its amplitude.
 
-**The rate filter.** The compensation takes off (w1 - w0) / tau . (r x a) and Simpson's rule of the squares,
-1/6 of w0's, 4/6 of wm's, 1/6 of w1's. The dither in these is that of the increments times a gain. At the ends
-it is G_j = sinc(f_j tau) sum_m h_m exp(i W_j tau (m - 1/2)), turned by -+ W_j tau / 2 from the middle. In the
-middle it is sinc(f_j tau) where wm is the interval's own angle; then, of gyros of different frequencies, the
-mean taken off is 2/3 sinc^2 + 1/3 |G|^2 of the mean above, and no filter of the ends alone brings it below
-0.38 of that at 400 Hz. So the filter `dither` has wm = (w0 + w1) / 2, of gain G_j cos(W_j tau / 2). Where the
-block's dither is in the increments and the case rests, all of that is false; where the case moves, the effect
-is true, and what the filter does not pass is left.
+**The rate filter.** The compensation subtracts (w1 - w0) / tau . (r x a) and the mean of the squares by
+Simpson's rule, 1/6 w0, 4/6 wm, 1/6 w1. The dither in these rates is that of the increments times a gain. At
+the ends it is G_j = sinc(f_j tau) sum_m h_m exp(i W_j tau (m - 1/2)), with a phase of -+ W_j tau / 2 from the
+middle. In the middle it is sinc(f_j tau) if wm is the angle of the interval itself; then, for gyros of
+different frequencies, the subtracted mean is 2/3 sinc^2 + 1/3 |G|^2 of the mean above, and no filter of the
+ends alone reduces it below 0.38 of that at 400 Hz. Therefore the filter `dither` has wm = (w0 + w1) / 2, with
+the gain G_j cos(W_j tau / 2). If the dither of the block is in the increments and the case is at rest, the
+whole compensation is false; if the case moves, the effect is true, and what the filter blocks remains.
 
-Arms count from the origin of b, which the dither leaves in place here: where the case turns about another
-point, state the arms from there (gauge ``given``).
+Lever arms are measured from the origin of b, which the dither does not move; if the case turns about another
+point, give the lever arms from that point (gauge ``given``).
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -64,19 +65,19 @@ AXES: Final = "xyz"
 
 
 _HZ_DECIMALS: Final = 6
-"""Lines nearer than this are one line."""
+"""Decimals of a frequency in Hz within which lines are one line."""
 
 
 @dataclass(frozen=True)
 class Dither:
-    """Dithering about fixed axes.
+    """Dither about fixed axes.
 
     Parameters
     ----------
     axes_b : ndarray, shape (n, 3)
-        Row j: u_j, body axes; of length 1 where a body turns.
+        Row j: u_j, body axes; unit vectors if a body turns.
     amplitude_rad, frequency_hz, phase_rad : ndarray, shape (n,)
-        Of the angle a sin(2 pi f t + phase).
+        Angle a sin(2 pi f t + phase).
     """
 
     axes_b: Array
@@ -90,7 +91,7 @@ class Dither:
         return 2.0 * np.pi * self.frequency_hz * self.amplitude_rad
 
     def alone(self, gyro: int) -> "Dither":
-        """Give the same with one gyro dithering."""
+        """Return the same with dither of one gyro only."""
         return replace(
             self, amplitude_rad=np.where(np.arange(len(self.rate)) == gyro, self.amplitude_rad, 0.0)
         )
@@ -99,14 +100,14 @@ class Dither:
 def in_increments(
     C_bg: ArrayLike, amplitude_rad: ArrayLike, frequency_hz: ArrayLike, phase_rad: ArrayLike = (0.0, 0.0, 0.0)
 ) -> Dither:
-    """Dither of the blocks as increments in body axes show it: each gyro its own, along a column of C_bg.
+    """Return the dither of the blocks in the increments: gyro j along column j of C_bg.
 
     Parameters
     ----------
     C_bg : array_like, shape (3, 3)
         Gyro axes to body.
     amplitude_rad, frequency_hz, phase_rad : array_like, shape (3,)
-        Of the block against the case, see `Dither`.
+        Angle of each block relative to the case, see `Dither`.
 
     Returns
     -------
@@ -118,14 +119,14 @@ def in_increments(
 def of_case(
     C_bg: ArrayLike, amplitude_rad: ArrayLike, frequency_hz: ArrayLike, phase_rad: ArrayLike = (0.0, 0.0, 0.0)
 ) -> Dither:
-    """Dither of the case, about the gyros' sensing directions, rows of inv(C_bg).
+    """Return the dither of the case about the sensing directions of the gyros, rows of inv(C_bg).
 
     Parameters
     ----------
     C_bg : array_like, shape (3, 3)
         Gyro axes to body.
     amplitude_rad, frequency_hz, phase_rad : array_like, shape (3,)
-        Of the case against inertial space, see `Dither`.
+        Angle of the case relative to inertial space, see `Dither`.
 
     Returns
     -------
@@ -143,16 +144,16 @@ def _each_gyro(*values: ArrayLike) -> Iterator[Array]:
 
 @dataclass(frozen=True)
 class LineSpectrum:
-    """A specific force along each accelerometer as a sum of lines: Re sum c exp(2 pi i f t).
+    """Specific force along each accelerometer as a sum of lines: Re sum c exp(2 pi i f t).
 
     Parameters
     ----------
     names : tuple of str
-        Which line: `mean`, `Wx`, `2 Wx`, `Wx-Wy`, `Wx+Wy`; several of one frequency in a row.
+        Name of each line: `mean`, `Wx`, `2 Wx`, `Wx-Wy`, `Wx+Wy`; joined if their frequency is the same.
     frequency_hz : ndarray, shape (n,)
         Ascending, the mean first.
     phasor : ndarray, shape (n, 3)
-        m/s^2; a column an accelerometer.
+        Complex amplitudes, m/s^2; column i: accelerometer i.
     """
 
     names: tuple[str, ...]
@@ -161,28 +162,28 @@ class LineSpectrum:
 
     @property
     def mean(self) -> Array:
-        """What is rectified, m/s^2, shape (3,)."""
+        """Rectified part, m/s^2, shape (3,)."""
         rectified: Array = self.phasor[self.frequency_hz == 0.0].real.sum(axis=0)
         return rectified
 
     @property
     def amplitude(self) -> Array:
-        """Of each line, m/s^2, shape (n, 3)."""
+        """Amplitude of each line, m/s^2, shape (n, 3)."""
         size: Array = np.abs(self.phasor)
         return size
 
     def at(self, t_s: ArrayLike) -> Array:
-        """Give the force at times, m/s^2, shape (..., 3)."""
+        """Return the force at times, m/s^2, shape (..., 3)."""
         turns = np.asarray(t_s, np.float64)[..., None] * self.frequency_hz
         force: Array = np.real(np.exp(2j * np.pi * turns) @ self.phasor).astype(np.float64)
         return force
 
     def averaged(self, interval_s: float) -> "LineSpectrum":
-        """Give the mean over intervals, at the time of their middles: what increments hold."""
+        """Return the mean over sample intervals, at their middles, as increments contain it."""
         return replace(self, phasor=self.phasor * np.sinc(self.frequency_hz * interval_s)[:, None])
 
-    def seen(self, interval_s: float) -> "LineSpectrum":
-        """Give the lines where samples show them, no higher than half the sample rate.
+    def aliased(self, interval_s: float) -> "LineSpectrum":
+        """Return the lines at the frequencies of their aliases, at most half the sample rate.
 
         Parameters
         ----------
@@ -191,13 +192,13 @@ class LineSpectrum:
 
         Returns
         -------
-        Lines
+        LineSpectrum
             The same values at these times.
         """
         m = np.rint(self.frequency_hz * interval_s)
         # exp(2 pi i m F t) is (-1)^m in the middles
         phasor = self.phasor * np.where(m % 2 == 0, 1.0, -1.0)[:, None]
-        return _gathered(zip(self.names, self.frequency_hz - m / interval_s, phasor, strict=True))
+        return _merged(zip(self.names, self.frequency_hz - m / interval_s, phasor, strict=True))
 
     def __sub__(self, other: "LineSpectrum") -> "LineSpectrum":
         pairs = (
@@ -205,16 +206,16 @@ class LineSpectrum:
             for lines, sign in ((self, 1.0), (other, -1.0))
             for name, frequency, phasor in zip(lines.names, lines.frequency_hz, lines.phasor, strict=True)
         )
-        return _gathered(pairs)
+        return _merged(pairs)
 
 
 def size_effect(dither: Dither, C_ba: ArrayLike, r_b: ArrayLike) -> LineSpectrum:
-    """Give what the accelerometers feel at an instant: the three sums above.
+    """Return the instantaneous force on the accelerometers: the three sums above.
 
     Parameters
     ----------
     dither : Dither
-        Turning the case.
+        Dither of the case.
     C_ba : array_like, shape (3, 3)
         Accelerometer axes to body.
     r_b : array_like, shape (3, 3)
@@ -222,7 +223,7 @@ def size_effect(dither: Dither, C_ba: ArrayLike, r_b: ArrayLike) -> LineSpectrum
 
     Returns
     -------
-    Lines
+    LineSpectrum
     """
     one = np.ones_like(dither.rate, np.complex128)
     return _lines(dither, C_ba, r_b, 2j * np.pi * dither.frequency_hz, [(1.0, one)])
@@ -231,23 +232,23 @@ def size_effect(dither: Dither, C_ba: ArrayLike, r_b: ArrayLike) -> LineSpectrum
 def compensated(
     dither: Dither, C_ba: ArrayLike, r_b: ArrayLike, rate_filter: RateFilter, interval_s: float
 ) -> LineSpectrum:
-    """Give what the compensation takes off increments in which a dither is, as a mean over each interval.
+    """Return what the compensation subtracts from increments with dither, as a mean over each interval.
 
     Parameters
     ----------
     dither : Dither
-        As the gyro increments show it.
+        Dither in the gyro increments.
     C_ba, r_b : array_like, shape (3, 3)
-        As for `size_effect`, of the certificate.
+        As for `size_effect`, from the certificate.
     rate_filter : RateFilter
-        That makes the rates at interval ends.
+        Filter that gives the rates at the ends of the intervals.
     interval_s : float
-        Sample interval.
+        Sample interval, s.
 
     Returns
     -------
-    Lines
-        At the middles of the intervals; take `seen` for the frequencies among the samples.
+    LineSpectrum
+        At the middles of the intervals; see `aliased` for the frequencies in the samples.
     """
     frequency = dither.frequency_hz
     end = gain(rate_filter, frequency, interval_s)
@@ -260,16 +261,16 @@ def compensated(
 
 
 def gain(rate_filter: RateFilter, frequency_hz: ArrayLike, interval_s: float) -> Phasors:
-    """Give the rate that a filter tells at an interval's end over the true one there, for a vibration.
+    """Return the ratio of the filtered to the true rate at the end of an interval, for a vibration.
 
     Parameters
     ----------
     rate_filter : RateFilter
-        Fed with true increments.
+        The filter, applied to exact increments.
     frequency_hz : array_like, shape (...)
-        Of the vibration.
+        Frequency of the vibration.
     interval_s : float
-        Sample interval.
+        Sample interval, s.
 
     Returns
     -------
@@ -289,9 +290,9 @@ def _lines(
     slope: Phasors,
     squares: Sequence[tuple[float, Phasors]],
 ) -> LineSpectrum:
-    """Lines of the tangential part, `slope` times the rates, and of a weighted sum of centripetal ones.
+    """Return lines of the tangential part, `slope` times the rates, and of weighted centripetal parts.
 
-    Each of `squares` is a weight and the gains of the gyros' rates.
+    Each of `squares` is a weight and the gains of the gyro rates.
     """
     a = np.linalg.inv(np.asarray(C_ba, np.float64))
     r = np.asarray(r_b, np.float64)
@@ -323,11 +324,11 @@ def _lines(
                 yield f"W{AXES[j]}-W{AXES[k]}", f[j] - f[k], p * q.conjugate() * between
                 yield f"W{AXES[j]}+W{AXES[k]}", f[j] + f[k], p * q * between
 
-    return _gathered(terms())
+    return _merged(terms())
 
 
-def _gathered(terms: Iterable[tuple[str, float, Phasors]]) -> LineSpectrum:
-    """Make one line of all that are at a frequency; a negative one is its mirror."""
+def _merged(terms: Iterable[tuple[str, float, Phasors]]) -> LineSpectrum:
+    """Merge the lines of each frequency; a negative frequency is the complex conjugate."""
     names: dict[float, dict[str, None]] = {}
     sums: dict[float, Phasors] = {}
     for name, frequency, phasor in terms:

@@ -21,20 +21,20 @@ def dither_text(
     interval_s: float,
     reaction: float = 0.01,
 ) -> str:
-    """Tell what a unit's dither does: to its accelerometers, and through the rate filters.
+    """Return the effect of gyro dither on the accelerometers, and on the compensation with each rate filter.
 
     Parameters
     ----------
     calibration : Calibration
-        With lever arms.
+        Calibration with lever arms.
     amplitude_arcsec, frequency_hz : array_like, shape (3,)
-        Of the blocks x, y, z. Phases are zero; they matter where frequencies are equal.
+        Dither of the blocks x, y, z. Phases are zero; they matter if frequencies are equal.
     rate_filters : sequence of RateFilter
-        To be told of.
+        Rate filters to compare.
     interval_s : float
-        Sample interval.
+        Sample interval, s.
     reaction : float, optional
-        Of the case: its angle over the block's.
+        Angle of the case divided by that of the block.
 
     Returns
     -------
@@ -52,7 +52,7 @@ def dither_text(
     block = in_increments(C_bg, amplitude, frequency_hz)
     case = of_case(C_bg, reaction * amplitude, frequency_hz)
 
-    def told() -> Iterator[str]:
+    def lines() -> Iterator[str]:
         sizes = " ".join(f"{np.linalg.norm(r) / MM:.1f}" for r in arms.r_b)
         yield f"unit {calibration.serial_number}: arms of {sizes} mm, gauge {arms.gauge}"
         for j, axis in enumerate(AXES):
@@ -61,29 +61,36 @@ def dither_text(
                 f"{block.rate[j]:.3f} rad/s; the case {reaction * block.rate[j]:.3g} rad/s"
             )
         if np.unique(block.frequency_hz[amplitude > 0.0]).size < np.count_nonzero(amplitude):
-            yield "gyros of one frequency: the means of all together are those of equal phases"
+            yield "gyros have the same frequency: the mean of all together assumes equal phases"
         yield ""
         yield from _spectrum(
-            f"The case's reaction, {100.0 * reaction:g} %, true; on accelerometers x, y, z in ug",
+            f"Reaction of the case, {100.0 * reaction:g} %, true motion; on accelerometers x, y, z in ug",
             *(case, geometry, interval_s),
         )
         yield from _spectrum(
-            "The blocks' dither, were it motion of the case; on accelerometers x, y, z in ug",
+            "Dither of the blocks, as if it were motion of the case; on accelerometers x, y, z in ug",
             *(block, geometry, interval_s),
         )
-        yield "What comes into the mean of the compensated velocity, ug"
+        yield "Error of the mean compensated specific force, ug"
         yield (
-            f"  {'':<8} {'late':>4} {'passes':>8}   {'block in the increments: false':^32}   "
-            f"{'case: left of the true':^32}"
+            f"  {'':<8} {'lag':>4} {'gain':>8}   {'false, from blocks in increments':^32}   "
+            f"{'residual of the true, from case':^32}"
         )
-        truth = size_effect(case, *geometry).averaged(interval_s)
-        for each in rate_filters:
-            passes = np.max(np.abs(gain(each, block.frequency_hz[amplitude > 0.0], interval_s)), initial=0.0)
-            false = -compensated(block, *geometry, each, interval_s).seen(interval_s).mean
-            left = (truth - compensated(case, *geometry, each, interval_s)).seen(interval_s).mean
-            yield f"  {each.name:<8} {each.lag:>4} {passes:>8.1e}   {_three(false)}   {_three(left)}"
+        truth = size_effect(case, *geometry).averaged(interval_s).aliased(interval_s)
+        for rate_filter in rate_filters:
+            largest = np.abs(gain(rate_filter, block.frequency_hz[amplitude > 0.0], interval_s)).max(
+                initial=0.0
+            )
+            false, corrected = (
+                compensated(dither, *geometry, rate_filter, interval_s).aliased(interval_s)
+                for dither in (block, case)
+            )
+            yield (
+                f"  {rate_filter.name:<8} {rate_filter.lag:>4} {largest:>8.1e}   "
+                f"{_three(-false.mean)}   {_three((truth - corrected).mean)}"
+            )
 
-    return "".join(f"{line.rstrip()}\n" for line in told())
+    return "".join(f"{line.rstrip()}\n" for line in lines())
 
 
 def _spectrum(title: str, dither: Dither, geometry: tuple[Array, Array], interval_s: float) -> Iterator[str]:
@@ -92,13 +99,13 @@ def _spectrum(title: str, dither: Dither, geometry: tuple[Array, Array], interva
         yield f"  {f'mean, gyro {axis} alone':<37} {_three(size_effect(dither.alone(gyro), *geometry).mean)}"
     lines = size_effect(dither, *geometry)
     yield f"  {'mean, all':<37} {_three(lines.mean)}"
-    yield f"  {'line':>10} {'seen at':>8} {'increments':>12}     {'amplitude':^32}"
+    yield f"  {'line':>10} {'alias':>8} {'averaging':>12}     {'amplitude':^32}"
     rate_hz = 1.0 / interval_s
     for name, frequency, amplitude in zip(lines.names, lines.frequency_hz, lines.amplitude, strict=True):
         if frequency and np.any(amplitude > 1e-6 * UG):
-            seen = abs(frequency - rate_hz * np.rint(frequency / rate_hz))
-            keep = abs(np.sinc(frequency * interval_s))
-            where = f"{frequency:>7g} Hz {seen:>5g} Hz {f'keep {keep:.3f}':>12}"
+            alias = abs(frequency - rate_hz * np.rint(frequency / rate_hz))
+            factor = abs(np.sinc(frequency * interval_s))
+            where = f"{frequency:>7g} Hz {alias:>5g} Hz {factor:>12.3f}"
             yield f"  {where}     {_three(amplitude)}   {name}"
     yield ""
 

@@ -1,4 +1,4 @@
-"""A document: one content, as text for a terminal and as one HTML file with its figures inside."""
+"""Content of a document, without its form: `text` and `html` render it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,14 +14,14 @@ class Paragraph:
 
 @dataclass(frozen=True)
 class KeyValues:
-    """What and how much."""
+    """Names with their values."""
 
     rows: tuple[tuple[str, str], ...]
 
 
 @dataclass(frozen=True)
 class Table:
-    """Rows under a head; the first column is text, the others numbers."""
+    """Rows below a header; the first column is text, the others are numbers."""
 
     title: str
     head: tuple[str, ...]
@@ -30,7 +30,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure, drawn where it is shown."""
+    """A figure; drawn only if it is shown."""
 
     title: str
     draw: Callable[[], bytes]
@@ -41,7 +41,7 @@ Block: TypeAlias = Paragraph | KeyValues | Table | Figure
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the report with its heading."""
+    """Blocks below a heading."""
 
     title: str
     blocks: tuple[Block, ...]
@@ -49,7 +49,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Document:
-    """Sections under a title."""
+    """Sections below a title."""
 
     title: str
     subtitle: str
@@ -57,7 +57,7 @@ class Document:
 
 
 def sanitise(text: str) -> str:
-    """Text of a file with nothing in it that could steer a terminal."""
+    """Return text of a file without characters that could control a terminal."""
     return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
 
 

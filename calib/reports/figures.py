@@ -3,23 +3,24 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from io import BytesIO
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from calib.estimation.result import RunResult
 from calib.estimation.runs import Run
 from imudrv.arrays import Array
 from imudrv.units import MM
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
 WIDTH_IN: Final = 7.0
 
 
 POINTS: Final = 2000
-"""So many points of a curve are drawn at the least."""
+"""Minimum number of points of a long curve."""
 
 
 _COLOURS: Final = ("#1f5fa8", "#b8561a", "#3b7a4b")
@@ -48,17 +49,20 @@ _STYLE: Final[dict[Any, Any]] = {
 
 
 class _Canvas:
-    """A figure on its way to SVG."""
+    """A figure, and its SVG once it is complete."""
 
-    def __init__(self, height_in: float) -> None:
-        self.figure = Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
+    def __init__(self, figure: "Figure") -> None:
+        self.figure = figure
         self.svg = b""
 
 
 @contextmanager
 def _canvas(height_in: float) -> Iterator[_Canvas]:
-    with mpl.rc_context(_STYLE):
-        canvas = _Canvas(height_in)
+    from matplotlib import rc_context  # slow to import; not needed for text
+    from matplotlib.figure import Figure
+
+    with rc_context(_STYLE):
+        canvas = _Canvas(Figure(figsize=(WIDTH_IN, height_in), layout="constrained"))
         yield canvas
         out = BytesIO()
         canvas.figure.savefig(out, format="svg", metadata={"Date": None})
@@ -66,7 +70,7 @@ def _canvas(height_in: float) -> Iterator[_Canvas]:
 
 
 def sensing_points(r_b: Array, C_ba: Array) -> bytes:
-    """Draw where the accelerometers sense, and along which axes, in three views.
+    """Draw sensing points and sensing directions of the accelerometers in three views.
 
     Parameters
     ----------
@@ -86,7 +90,7 @@ def sensing_points(r_b: Array, C_ba: Array) -> bytes:
     middle = (shown.min(axis=0) + shown.max(axis=0)) / 2.0
     half = 0.6 * float(np.ptp(shown, axis=0).max())
     with _canvas(2.7) as canvas:
-        # what lies to the right and up on the paper, and what points at the one who looks
+        # axes to the right and up on the paper, and the direction towards the viewer
         views = (
             ("from above", 0, 1, [0, 0, 1]),
             ("from behind", 0, 2, [0, -1, 0]),
@@ -124,15 +128,15 @@ def sensing_points(r_b: Array, C_ba: Array) -> bytes:
     return canvas.svg
 
 
-def velocities(run: Run, told: RunResult) -> bytes:
-    """Velocity of a run at rest with what the estimate says of it, and what is left.
+def velocities(run: Run, result: RunResult) -> bytes:
+    """Draw the velocity of a run at rest with the estimate, and the residuals.
 
     Parameters
     ----------
     run : Run
-        For the time of the rotation.
-    told : RunResult
-        Of that run.
+        The run, for the time of its rotation.
+    result : RunResult
+        Estimate for that run.
 
     Returns
     -------
@@ -140,17 +144,17 @@ def velocities(run: Run, told: RunResult) -> bytes:
         SVG.
     """
     turned = (float(run.t_s[run.before][-1]), float(run.t_s[run.after][0]))
-    before = told.t_s < turned[0]
+    before = result.t_s < turned[0]
     with _canvas(2.2) as canvas:
         left, right = canvas.figure.subplots(1, 2)
         for k, name in enumerate(("east", "north")):
-            v, fitted = told.v_n[:, k] / MM, told.fitted_n[:, k] / MM
-            left.plot(told.t_s, v, ".", color=_COLOURS[k], markersize=3, label=name)
+            v, fitted = result.v_n[:, k] / MM, result.fitted_n[:, k] / MM
+            left.plot(result.t_s, v, ".", color=_COLOURS[k], markersize=3, label=name)
             for part in (before, ~before):
-                left.plot(told.t_s[part], fitted[part], color=_COLOURS[k], alpha=0.6)
-            right.plot(told.t_s, v - fitted, ".", color=_COLOURS[k], markersize=3)
+                left.plot(result.t_s[part], fitted[part], color=_COLOURS[k], alpha=0.6)
+            right.plot(result.t_s, v - fitted, ".", color=_COLOURS[k], markersize=3)
         left.set(title="velocity at rest (points), estimate (lines)", ylabel="mm/s")
-        right.set(title="what the estimate leaves", ylabel="mm/s")
+        right.set(title="residuals", ylabel="mm/s")
         for axes in (left, right):
             axes.axvspan(*turned, color="#eef0f3", linewidth=0)
             axes.set_xlabel("time from the start of navigation (s)")
@@ -158,26 +162,26 @@ def velocities(run: Run, told: RunResult) -> bytes:
     return canvas.svg
 
 
-def before_after(told: Sequence[RunResult]) -> bytes:
-    """Horizontal velocity after each rotation, as it came and without the size effect.
+def before_after(runs: Sequence[RunResult]) -> bytes:
+    """Draw the horizontal velocity after each rotation, measured and without the size effect.
 
     Parameters
     ----------
-    told : sequence of RunResult
-        The rotations, called by their numbers.
+    runs : sequence of RunResult
+        The rotations; numbered from 1.
 
     Returns
     -------
     bytes
         SVG.
     """
-    with _canvas(0.7 + 0.32 * len(told)) as canvas:
+    with _canvas(0.7 + 0.32 * len(runs)) as canvas:
         axes: Axes = canvas.figure.subplots()
-        at = np.arange(len(told))
+        at = np.arange(len(runs))
         for k, (name, values) in enumerate(
             (
-                ("as measured", [run.V_n for run in told]),
-                ("without the size effect", [run.compensated_n for run in told]),
+                ("as measured", [run.V_n for run in runs]),
+                ("without the size effect", [run.compensated_n for run in runs]),
             )
         ):
             speed = [np.hypot(v[0], v[1]) / MM for v in values]
@@ -191,17 +195,19 @@ def before_after(told: Sequence[RunResult]) -> bytes:
     return canvas.svg
 
 
-def courses(t_s: Array, normal_n: Array, compensated_n: Array, moved_s: tuple[float, float] | None) -> bytes:
-    """Velocity error over time of a navigation without and one with the size effect compensated.
+def navigations(
+    t_s: Array, normal_n: Array, compensated_n: Array, moved_s: tuple[float, float] | None
+) -> bytes:
+    """Draw the velocity error over time without and with size-effect compensation.
 
     Parameters
     ----------
     t_s : ndarray, shape (n,)
-        Time.
+        Time from the end of the alignment, s.
     normal_n, compensated_n : ndarray, shape (n, 3)
-        Velocities east, north and up, m/s.
+        Velocity: east, north, up, m/s.
     moved_s : tuple of 2 float, or None
-        The motion.
+        Start and end of the motion, s.
 
     Returns
     -------
@@ -223,16 +229,16 @@ def courses(t_s: Array, normal_n: Array, compensated_n: Array, moved_s: tuple[fl
 
 
 def directions(sigma: Array, rank: int, limit_m: float) -> bytes:
-    """How well each principal direction of the nine components is seen.
+    """Draw the uncertainty of each principal direction of the nine components.
 
     Parameters
     ----------
     sigma : ndarray, shape (9,)
-        1-sigma of each, m, best first.
+        Standard uncertainties, m, ascending.
     rank : int
-        How many are seen.
+        Number of observable directions.
     limit_m : float
-        Worse than this is not seen, m.
+        Largest uncertainty of an observable direction, m.
 
     Returns
     -------
@@ -243,8 +249,8 @@ def directions(sigma: Array, rank: int, limit_m: float) -> bytes:
         axes: Axes = canvas.figure.subplots()
         at = np.arange(1, len(sigma) + 1)
         axes.axhline(limit_m / MM, color=_COLOURS[1], linestyle="--", label="limit")
-        axes.semilogy(at[:rank], sigma[:rank] / MM, "o", color=_COLOURS[0], label="seen")
-        axes.semilogy(at[rank:], sigma[rank:] / MM, "o", color=_GREY, fillstyle="none", label="not seen")
+        axes.semilogy(at[:rank], sigma[:rank] / MM, "o", color=_COLOURS[0], label="observable")
+        axes.semilogy(at[rank:], sigma[rank:] / MM, "o", color=_GREY, fillstyle="none", label="unobservable")
         axes.set(xlabel="principal direction of (r_x, r_y, r_z)", ylabel="sigma (mm)")
         axes.set_xticks(at)
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7)

@@ -1,6 +1,6 @@
-"""Numbers and counts as reports show them."""
+"""Format of numbers in reports."""
 
-from math import floor, log10
+from math import floor, isnan, log10
 
 import numpy as np
 
@@ -9,12 +9,17 @@ from imudrv.units import MM
 
 
 def three_digits(value: float) -> str:
-    """Three digits; whole numbers up to a million whole."""
+    """Return a number with three significant digits; from 1000 to a million, all digits before the point."""
     return f"{value:.0f}" if 1000.0 <= abs(value) < 1e6 else f"{value:#.3g}".rstrip(".")
 
 
+def mm(value: float, spec: str = ".2f") -> str:
+    """Return a length in mm, or a velocity in mm/s, in a format; nothing for NaN."""
+    return "" if isnan(value) else f"{value / MM + 0.0:{spec}}"
+
+
 def decimals(sigma_m: Array) -> int:
-    """Places behind the point, mm, that leave two digits of the smallest uncertainty that is not zero."""
+    """Return the number of decimals, in mm, that shows two digits of the smallest nonzero uncertainty."""
     least = float(sigma_m[sigma_m > 1e-9].min(initial=1.0)) / MM
     return int(np.clip(1 - floor(log10(least)), 1, 5))
 

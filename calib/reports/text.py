@@ -18,7 +18,7 @@ WIDTH: Final = 80
 
 
 def for_terminal(document: Document) -> RenderableType:
-    """Show a document on a console of rich's; without its drawings."""
+    """Return a document for a console, without its figures."""
     parts: list[RenderableType] = [
         RichText(document.title, style="bold"),
         RichText(document.subtitle),
@@ -30,13 +30,22 @@ def for_terminal(document: Document) -> RenderableType:
     return Group(*parts)
 
 
+def print_document(document: Document) -> None:
+    """Print a document: in colour and in full width on a terminal, elsewhere as plain text."""
+    console = Console(highlight=False)
+    if console.is_terminal:
+        console.print(for_terminal(document))
+    else:
+        console.file.write(as_text(document))
+
+
 def as_text(document: Document) -> str:
-    """Tell a document as plain text of 80 columns; without its drawings."""
+    """Return a document as plain text of 80 columns, without its figures."""
     return _text(for_terminal(document))
 
 
 def blocks_text(blocks: Sequence[Block]) -> str:
-    """Tell blocks alone, as plain text."""
+    """Return blocks alone as plain text."""
     return _text(Group(*chain.from_iterable(_shown(block) for block in blocks)))
 
 

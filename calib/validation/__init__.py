@@ -1,6 +1,6 @@
-"""Does compensation help? The same pulses navigated without and with the size effect, and judged.
+"""Compare navigation of the same pulses with and without size-effect compensation.
 
-trial       one trial and its settings
+trial       a trial and its settings
 navigate    navigate a trial
 skew        correct a gyro-accelerometer skew
 verdict     metrics and verdict

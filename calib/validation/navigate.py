@@ -1,25 +1,26 @@
-"""Does compensation help? The same pulses navigated twice, without and with the size effect, and judged.
+"""Compare navigation of the same pulses with and without size-effect compensation.
 
-Both courses are complete: each compensates, aligns on the first rest and navigates through what follows. They
-are judged where the true velocity is known to be zero, in the rests; during the motion it is not, and there
-it depends on the gauge. So it does, by noise of the rate, in a single sample at rest: a lever arm common to
-all three points turns it into velocity. Therefore velocity is always that of the centroid of the three
-sensing points, whichever gauge the calibration is in.
+Both navigations are complete: each compensates, aligns on the first rest and navigates to the end. They are
+evaluated in the rests, where the true velocity is known to be zero; during the motion it is not, and depends
+on the gauge. In a single sample it does so even at rest, because a lever arm common to all three points turns
+the noise of the rate into velocity. Therefore the velocity is always that of the centroid of the three
+sensing points, whatever the gauge of the calibration.
 
-**Fast motion** (`smaller`): horizontal velocity, its mean over the first second of the rest after the motion,
-has to be smaller by `SMALLER` with compensation. The first second, because residual biases and tilts make a
-ramp of velocity that has nothing to do with lever arms and is in both courses alike. Where a simulation can
-give it, the floor is told too: the course of a twin, the same unit with the same noise and motion but
-accelerometers that all sense in one point.
+**Fast motion** (`reduced`): compensation has to reduce the mean horizontal velocity over the first second of
+the rest after the motion by `MIN_REDUCTION`. Only the first second, because residual biases and tilts cause a
+velocity ramp that is independent of the lever arms and the same in both navigations. A simulation also gives
+the lower bound: the velocity of a twin, the same unit with the same noise and motion but with accelerometers
+that all sense at one point.
 
-**No motion, or vibration** (`same`): over the whole rest, rms, the two courses must not differ by more than
-`SAME` of the velocity without compensation, nor by more than the sensors' noise makes of velocity in the time
-since the alignment,
+**No motion, or vibration** (`unchanged`): over the whole rest, the rms difference of the two navigations must
+be less than `MAX_CHANGE` of the velocity without compensation, and less than the velocity that the sensor
+noise causes in the time t since the alignment,
 
     variance = q_v^2 (t/2 + sin(2 W t) / 4 W) + (g q_a / W)^2 (t/2 - sin(2 W t) / 4 W),    W^2 = g / R
 
-for each axis, q_v and q_a the random walks of velocity and tilt that the rests show: Schuler's oscillator,
-driven by white noise (Titterton and Weston, Strapdown Inertial Navigation Technology, 2nd ed., chapter 12).
+for each axis, with q_v and q_a the random walks of velocity and tilt estimated in the rests: Schuler's
+oscillator driven by white noise (Titterton and Weston, Strapdown Inertial Navigation Technology, 2nd ed.,
+chapter 12).
 """
 
 from collections.abc import Iterable, Iterator
@@ -46,20 +47,20 @@ from imudrv.units import NS
 
 
 def navigate(
-    name: str, pulses: Iterable[Records], setting: TrialSettings, twin: Iterable[Records] | None = None
+    name: str, pulses: Iterable[Records], settings: TrialSettings, twin: Iterable[Records] | None = None
 ) -> Trial:
-    """Navigate pulses twice, side by side.
+    """Navigate pulses twice in parallel, without and with compensation.
 
     Parameters
     ----------
     name : str
-        How reports call the trial.
+        Name of the trial in reports.
     pulses : iterable of ndarray of PULSES
-        In order.
-    setting : Setting
-        How.
+        Pulses of the unit, in their order.
+    settings : TrialSettings
+        Calibration, site and processing.
     twin : iterable of ndarray of PULSES, optional
-        Of the same unit without lever arms.
+        Pulses of the same unit without lever arms.
 
     Returns
     -------
@@ -70,30 +71,28 @@ def navigate(
     InputError
         The first rest is too short for the alignment, or none follows the motion.
     """
-    known = setting.known()
-    normal, compensated = (
-        _NavigationChain(setting, replace(known, r_b=None)),
-        _NavigationChain(setting, known),
-    )
+    known = settings.coefficients()
+    normal = _NavigationChain(settings, replace(known, r_b=None))
+    compensated = _NavigationChain(settings, known)
 
-    def passing() -> Iterator[Records]:
+    def uncompensated() -> Iterator[Records]:
         for piece in pulses:
             compensated.feed(piece)
             yield normal.feed(piece)
         compensated.close()
         normal.close()
 
-    segments = find_segments(passing())
-    moved_s = _motion(name, segments, setting.align_s)
+    segments = find_segments(uncompensated())
+    moved_s = _motion(name, segments, settings.align_s)
     v_n = normal.v_n(), compensated.v_n()
     n = min(map(len, v_n))
-    site = setting.site
+    site = settings.site
     return Trial(
         name,
         t_s=BLOCK_NS * NS * (np.arange(n, dtype=np.float64) + 0.5),
         normal=NavigatedVelocity(normal.aligned(), v_n[0][:n]),
         compensated=NavigatedVelocity(compensated.aligned(), v_n[1][:n]),
-        twin=None if twin is None else _navigate_twin(setting, known, twin, n),
+        twin=None if twin is None else _navigate_twin(settings, known, twin, n),
         moved_s=moved_s,
         peak_deg_per_s=max((rotation.peak_deg_per_s for rotation in segments.rotations), default=0.0),
         noise=pooled_noise(rest.differences for rest in segments.rests),
@@ -102,7 +101,7 @@ def navigate(
 
 
 def _motion(name: str, segments: Segments, align_s: float) -> tuple[float, float] | None:
-    """From the beginning of the first motion to the end of the last one, s from the end of the alignment."""
+    """Return start of the first and end of the last motion, s from the end of the alignment."""
     if not segments.rotations:
         return None
     rotations = segments.rotations
@@ -110,7 +109,7 @@ def _motion(name: str, segments: Segments, align_s: float) -> tuple[float, float
     if rest_s < align_s + BEFORE_S:
         raise InputError(
             f"{name}: expected a rest of {align_s + BEFORE_S:g} s at the beginning, {align_s:g} s of it for "
-            f"the alignment, got {rest_s:.1f} s; give a shorter alignment, or record a longer rest"
+            f"the alignment, got {rest_s:.1f} s; use a shorter alignment, or record a longer rest"
         )
     last = rotations[-1].after
     if last is None or last.duration_s < FIRST_S + GUARD_S:
@@ -119,9 +118,9 @@ def _motion(name: str, segments: Segments, align_s: float) -> tuple[float, float
 
 
 def _navigate_twin(
-    setting: TrialSettings, known: Coefficients, pulses: Iterable[Records], n: int
+    settings: TrialSettings, known: Coefficients, pulses: Iterable[Records], n: int
 ) -> NavigatedVelocity:
-    chain = _NavigationChain(replace(setting, skew_s=0.0), replace(known, r_b=None))
+    chain = _NavigationChain(replace(settings, skew_s=0.0), replace(known, r_b=None))
     for piece in pulses:
         chain.feed(piece)
     chain.close()
@@ -129,47 +128,47 @@ def _navigate_twin(
 
 
 class _NavigationChain:
-    """Pulses to velocities: compensate, put a skew right, align, navigate."""
+    """Pulses to velocities: compensate, correct the skew, align, navigate."""
 
-    def __init__(self, setting: TrialSettings, known: Coefficients) -> None:
-        site, layout = setting.site, setting.layout
+    def __init__(self, settings: TrialSettings, known: Coefficients) -> None:
+        site, layout = settings.site, settings.layout
         self._site = site
-        self._compensator = Compensator(known, layout, rate_filter(setting.rate_filter, layout.interval_ns))
-        self._skew = SkewCorrection(setting, known) if setting.skew_s else None
+        self._compensator = Compensator(known, layout, rate_filter(settings.rate_filter, layout.interval_ns))
+        self._skew = SkewCorrection(settings, known) if settings.skew_s else None
         priors = Priors()
         self._alignment = Alignment(
-            site.latitude_rad, priors.gyro_bias, priors.accelerometer_bias, setting.align_s
+            site.latitude_rad, priors.gyro_bias, priors.accelerometer_bias, settings.align_s
         )
         self._navigator: Navigator | None = None
-        self._size = BLOCK_NS // layout.interval_ns
+        self._samples = BLOCK_NS // layout.interval_ns
         self._means: list[Array] = []
-        self._over = np.zeros((0, 3))
+        self._remainder = np.zeros((0, 3))
 
     def feed(self, pulses: Records) -> Records:
-        """Take pulses; the increments that they gave."""
+        """Navigate pulses; return their increments."""
         increments = self._compensator.feed(pulses)
         if self._skew is not None:
             increments = self._skew.feed(pulses, increments)
-        self._take(increments)
+        self._navigate(increments)
         return increments
 
     def close(self) -> None:
-        """End of the pulses; the last few, whose rate is not known any more, do not count."""
+        """Check that navigation has started; the last samples, whose rate is unknown, are not navigated."""
         if self._navigator is None:
             raise InputError(
                 f"validation: expected samples beyond the alignment, got {self._alignment.elapsed_s:.1f} s "
-                "in all; give a shorter alignment, or record more"
+                "in all; use a shorter alignment, or record more"
             )
 
     def aligned(self) -> Aligned:
-        """The attitude that navigation started from."""
+        """Return the alignment from which navigation started."""
         return self._alignment.result()
 
     def v_n(self) -> Array:
-        """Velocities of each 20 ms."""
+        """Return the mean velocity of each 20 ms, m/s, shape (n, 3)."""
         return np.concatenate(self._means)
 
-    def _take(self, increments: Records) -> None:
+    def _navigate(self, increments: Records) -> None:
         if self._navigator is None:
             increments = self._alignment.feed(increments)
             if not self._alignment.done:
@@ -182,7 +181,7 @@ class _NavigationChain:
                 site.gravity_m_s2,
                 self._alignment.result().q_nb,
             )
-        v_n = np.concatenate([self._over, self._navigator.feed(increments)["v_n"]])
-        whole = len(v_n) - len(v_n) % self._size
-        self._means.append(v_n[:whole].reshape(-1, self._size, 3).mean(axis=1))
-        self._over = v_n[whole:].copy()
+        v_n = np.concatenate([self._remainder, self._navigator.feed(increments)["v_n"]])
+        whole = len(v_n) - len(v_n) % self._samples
+        self._means.append(v_n[:whole].reshape(-1, self._samples, 3).mean(axis=1))
+        self._remainder = v_n[whole:].copy()

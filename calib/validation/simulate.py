@@ -1,9 +1,9 @@
-"""The four simulated trials: a unit with errors, its arms from our procedure, what it is then put through.
+"""The four simulated trials: a unit with errors, its lever arms from the procedure, then the motion.
 
-A trial draws the real unit from its scenario: the calibration that all know, the errors that nobody knows,
-and where the accelerometers sense. With that same unit the procedure is run in simulation, three half turns,
-each a run with noise of its own; segments, alignment, navigation and estimate are those of `calib identify`.
-What it finds becomes the calibration of the trial. The truth never gets there.
+A trial draws the true unit from its scenario: the calibration that is known, errors that are not known, and
+the sensing points. The procedure is simulated with that same unit: three rotations by 180 deg, each a run
+with its own noise; detection, alignment, navigation and estimate are those of `calib identify`. The result
+becomes the calibration of the trial. The truth is never used there.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -39,11 +39,11 @@ PROCEDURE: Final = ("z-up", "x-up", "y-up")
 
 
 TRIALS: Final = {"rotation": "z-up", "rocking": "rocking", "vibration": "vibration", "static": "static"}
-"""Trials, and the shipped scenario of each."""
+"""Shipped scenario of each trial."""
 
 
 SKEW_S: Final = 1e-3
-"""By how much the accelerometers' sample ends too late where that is looked at, s."""
+"""Time by which accelerometer samples end too late in the skew trials, s."""
 
 
 BEFORE_S: Final = 10.0
@@ -52,18 +52,18 @@ BEFORE_S: Final = 10.0
 
 @dataclass(frozen=True)
 class SimulatedUnit:
-    """A unit, and what the procedure found of it.
+    """A simulated unit and the result of the procedure.
 
     Attributes
     ----------
     real : Calibration
-        As it really is; for the simulator alone.
+        True calibration; for the simulator only.
     found : Calibration
-        What is known of it: the calibration it came with, and the arms identified.
-    result : Identification
+        Known calibration: the nominal one with the identified lever arms.
+    result : LeverArmEstimate
         The estimate.
     skew_s : float
-        Of the accelerometers' samples, as estimated.
+        Estimated skew of the accelerometer samples, s.
     """
 
     real: Calibration
@@ -78,33 +78,35 @@ def subject(unit: Unit, seed: int, *, procedure: Sequence[str] = PROCEDURE) -> S
     Parameters
     ----------
     unit : Unit
-        Calibration, and errors that it is drawn from.
+        Nominal calibration and distribution of its errors.
     seed : int
-        Decides the unit, and the noise of every run.
+        Seed of the unit and of the noise of every run.
     procedure : sequence of str
-        Scenarios, the shipped ones' names; each motion in them serves.
+        Names of shipped scenarios; every motion in them is used.
 
     Returns
     -------
-    Subject
+    SimulatedUnit
     """
-    came_with = (unit.calibration or NOMINAL).model_copy(update={"size_effect": None})
+    nominal = (unit.calibration or NOMINAL).model_copy(update={"size_effect": None})
     real = true_calibration(unit, seed)
     built = unit.model_copy(update={"calibration": real, "residuals": Residuals()})
-    runs = [run for k, name in enumerate(procedure) for run in _evidence(name, built, [seed, k], came_with)]
+    runs = [
+        run for k, name in enumerate(procedure) for run in _simulated_runs(name, built, [seed, k], nominal)
+    ]
     result = estimate_joint(runs)
     skew_s = next(n.value for n in result.parameters if n.name == "skew_s")
     arms = LeverArms(result.R_b, result.covariance, result.gauge)
     return SimulatedUnit(
         real,
-        with_lever_arms(came_with, arms, PROVENANCE_IDENTIFIED, {"method": result.method}),
+        with_lever_arms(nominal, arms, PROVENANCE_IDENTIFIED, {"method": result.method}),
         result,
         skew_s,
     )
 
 
 def true_calibration(unit: Unit, seed: int) -> Calibration:
-    """The unit that a seed draws, as a calibration that would leave no error."""
+    """Return the calibration of the unit that a seed draws, which would leave no error."""
     nominal = unit.calibration or NOMINAL
     drawn = draw_true_unit(scenarios.load(PROCEDURE[0]).model_copy(update={"unit": unit, "seed": seed}))
     return nominal.model_copy(
@@ -124,14 +126,14 @@ def true_calibration(unit: Unit, seed: int) -> Calibration:
 
 
 def scenario(name: str, align_s: float = ALIGNMENT_S) -> Scenario:
-    """The scenario of a trial: a shipped one, its first rest long enough.
+    """Return the scenario of a trial: a shipped one with a first rest that is long enough.
 
     Parameters
     ----------
     name : {'rotation', 'rocking', 'vibration', 'static'}
-        Which.
+        Name of the trial.
     align_s : float
-        Length of the alignment.
+        Length of the alignment, s.
 
     Returns
     -------
@@ -155,52 +157,54 @@ def trial(
     filter_name: RateFilterName = RATE_FILTER,
     skew_s: float = 0.0,
 ) -> Trial:
-    """Put a unit through a trial.
+    """Simulate a trial with a unit.
 
     Parameters
     ----------
     label : str
-        How reports call it.
+        Name in reports.
     of : Scenario
-        The motion; noise, dither and skew of the unit.
-    who : Subject
+        Motion; noise, dither and skew of the unit.
+    who : SimulatedUnit
         The unit.
     seed : int
-        Of noise and motion.
+        Seed of noise and motion.
     align_s : float
-        Length of the alignment.
+        Length of the alignment, s.
     filter_name : str
         Rate filter for the size effect.
     skew_s : float
-        That is put right.
+        Skew to be corrected, s.
 
     Returns
     -------
     Trial
-        With the course of the twin that has no lever arms.
+        With the velocity of the twin without lever arms.
     """
     unit = of.unit.model_copy(update={"calibration": who.real, "residuals": Residuals()})
     run = of.model_copy(update={"seed": _seed([seed, len(PROCEDURE)]), "unit": unit})
     layout = profiles.load(PROFILE).layout()
-    setting = TrialSettings(layout, who.found, run.site, align_s, filter_name, skew_s)
-    return navigate(label, _pulses(run, layout.interval_ns), setting, _pulses(_twin(run), layout.interval_ns))
+    settings = TrialSettings(layout, who.found, run.site, align_s, filter_name, skew_s)
+    return navigate(
+        label, _pulses(run, layout.interval_ns), settings, _pulses(_twin(run), layout.interval_ns)
+    )
 
 
 def campaign(
     names: Sequence[str], seeds: Sequence[int], filter_name: RateFilterName, say: Callable[[str], None]
 ) -> Iterator[Trial]:
-    """Put units through trials.
+    """Simulate trials with several units.
 
     Parameters
     ----------
     names : sequence of str
-        Of `TRIALS`.
+        Names of trials, see `TRIALS`.
     seeds : sequence of int
-        One a unit.
+        Seed of each unit.
     filter_name : str
         Rate filter for the size effect.
     say : callable
-        Told what is going on.
+        Called with the name of each part of the work.
 
     Yields
     ------
@@ -216,15 +220,15 @@ def campaign(
 
 
 def skew_trials(seed: int) -> Iterator[Trial]:
-    """Rocking with accelerometers whose sample ends `SKEW_S` too late: ignored, and estimated and put right.
+    """Yield rocking with accelerometer samples that end `SKEW_S` too late: ignored, then corrected.
 
-    Half turns about the vertical do not show a skew, for they leave gravity where it is; the evidence is the
-    procedure and another rocking.
+    Rotations about the vertical do not determine a skew, because gravity keeps its direction; so the estimate
+    uses the procedure and another rocking.
 
     Parameters
     ----------
     seed : int
-        Of the unit.
+        Seed of the unit.
 
     Yields
     ------
@@ -241,14 +245,14 @@ def skew_trials(seed: int) -> Iterator[Trial]:
 
 
 def dither_trials(seed: int) -> Iterator[Trial]:
-    """The rotation with the blocks' dither left in the gyros' increments, with two rate filters.
+    """Yield the rotation with the gyro dither in the increments, with two rate filters.
 
-    The arms are those found while the unit took its dither out.
+    The lever arms are those identified with the dither removed by the unit.
 
     Parameters
     ----------
     seed : int
-        Of the unit.
+        Seed of the unit.
 
     Yields
     ------
@@ -256,40 +260,40 @@ def dither_trials(seed: int) -> Iterator[Trial]:
     """
     turn = scenario("rotation")
     who = subject(turn.unit, seed)
-    assert turn.unit.dither is not None
-    raw = turn.unit.dither.model_copy(update={"in_increments": 1.0})
-    turn = turn.model_copy(update={"unit": turn.unit.model_copy(update={"dither": raw})})
+    turn = turn.model_copy(update={"unit": _with_dither(turn.unit, 1.0)})
     filters: tuple[RateFilterName, ...] = ("causal", "dither")
     for name in filters:
         yield trial(f"rotation, raw dither, filter {name}", turn, who, seed, filter_name=name)
 
 
 def _twin(run: Scenario) -> Scenario:
-    """The same unit with accelerometers all in the origin of b and in time, and gyros free of dither."""
-    calibration = run.unit.calibration
-    assert calibration is not None
-    assert calibration.size_effect is not None
+    """Return the same run with accelerometers at the origin and in time, increments without dither."""
+    calibration = run.unit.calibration or NOMINAL
     none = (0.0, 0.0, 0.0)
     points = SizeEffect(r_mm=SensingPoints(x=none, y=none, z=none), gauge="centroid")
-    dither = run.unit.dither
-    unit = run.unit.model_copy(
+    unit = _with_dither(run.unit, 0.0).model_copy(
         update={
             "calibration": calibration.model_copy(update={"size_effect": points}),
             "accelerometer_skew_s": 0.0,
-            "dither": dither and dither.model_copy(update={"in_increments": 0.0}),
         }
     )
     return run.model_copy(update={"unit": unit})
 
 
+def _with_dither(unit: Unit, share: float) -> Unit:
+    """Return the unit with a share of its gyro dither, if it has any, in the increments."""
+    dither = unit.dither and unit.dither.model_copy(update={"in_increments": share})
+    return unit.model_copy(update={"dither": dither})
+
+
 ANY_MOTION: Final = RotationLimits(
     angle_deg=0.0, angle_tolerance_deg=1e9, least_peak_deg_per_s=0.0, axis_tilt_deg=90.0
 )
-"""A motion that is evidence without being a half turn, such as rocking, has to keep these."""
+"""Limits of motions that are no rotation by 180 deg, such as rocking."""
 
 
-def _evidence(name: str, unit: Unit, seed: list[int], known: Calibration) -> tuple[Run, ...]:
-    """The runs of one capture of the procedure."""
+def _simulated_runs(name: str, unit: Unit, seed: list[int], known: Calibration) -> tuple[Run, ...]:
+    """Return the runs of one simulated capture of the procedure."""
     layout = profiles.load(PROFILE).layout()
     run = scenarios.load(name).model_copy(update={"unit": unit, "seed": _seed(seed)})
     bare = coefficients(known)
@@ -305,7 +309,7 @@ def _evidence(name: str, unit: Unit, seed: list[int], known: Calibration) -> tup
 
 
 def _rows(matrix: Array) -> Any:
-    """A matrix as the models of files have it."""
+    """Return a matrix as tuples, as the file models have it."""
     return tuple(map(tuple, matrix.tolist()))
 
 
@@ -316,5 +320,5 @@ def _pulses(run: Scenario, interval_ns: int) -> Iterator[Records]:
 
 
 def _seed(parts: list[int]) -> int:
-    """A seed of its own for each run."""
+    """Return a different seed for each run."""
     return int(np.random.default_rng(parts).integers(2**63))

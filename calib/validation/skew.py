@@ -15,19 +15,19 @@ from imudrv.units import NS
 
 
 class SkewCorrection:
-    """Specific force back to the time of the gyros.
+    """Shift the specific force back to the time of the gyros.
 
-    Velocity felt up to `t + skew` is known at the end of each sample; in between a cubic through the four
-    samples around tells it (Lagrange). The size effect is that of the gyros' own time and is not moved.
+    The samples give the velocity up to `t + skew`; in between it is interpolated by a cubic through the four
+    nearest samples (Lagrange). The size effect is computed at the time of the gyros and is not shifted.
     """
 
-    def __init__(self, setting: TrialSettings, known: Coefficients) -> None:
-        layout = setting.layout
+    def __init__(self, settings: TrialSettings, known: Coefficients) -> None:
+        layout = settings.layout
         self._interval_ns = layout.interval_ns
         self._bare = Compensator(
-            replace(known, r_b=None), layout, rate_filter(setting.rate_filter, layout.interval_ns)
+            replace(known, r_b=None), layout, rate_filter(settings.rate_filter, layout.interval_ns)
         )
-        at = -setting.skew_s / (layout.interval_ns * NS)
+        at = -settings.skew_s / (layout.interval_ns * NS)
         first = floor(at)
         u = at - first
         self._weights = (
@@ -37,33 +37,33 @@ class SkewCorrection:
             (u + 1.0) * u * (u - 1.0) / 6.0,
         )
         self._offsets = range(first - 1, first + 3)
-        self._behind, self._ahead = max(0, 1 - first), max(0, first + 2)
-        self._felt = np.zeros((0, 3))  # of samples whose increments are still held back here
+        self._before, self._after = max(0, 1 - first), max(0, first + 2)
+        self._force = np.zeros((0, 3))  # of the samples in _waiting
         self._waiting: Records | None = None
         self._bare_dv = np.zeros((0, 3))
 
     def feed(self, pulses: Records, increments: Records) -> Records:
-        """Take pulses and their increments; increments with the specific force of their own time."""
+        """Take pulses and their increments; return increments with the force at the time of the gyros."""
         bare = self._bare.feed(pulses)
         if (bare["flags"] & Flag.MISSING_BEFORE).any() or (bare["interval_ns"] != self._interval_ns).any():
             raise InputError(
-                "skew: expected samples without gaps, got one; it cannot be put right over a gap"
+                "skew: expected samples without gaps, got a gap; a skew cannot be corrected over a gap"
             )
         self._bare_dv = np.concatenate([self._bare_dv, bare["dv_b"]])
-        felt, self._bare_dv = self._bare_dv[: len(increments)], self._bare_dv[len(increments) :]
-        effect = felt - increments["dv_b"]
+        force, self._bare_dv = self._bare_dv[: len(increments)], self._bare_dv[len(increments) :]
+        effect = force - increments["dv_b"]
         rows = increments.copy()
         rows["dv_b"] = effect
         rows = rows if self._waiting is None else np.concatenate([self._waiting, rows])
-        felt = np.concatenate([self._felt, felt])
-        stop = len(rows) - self._ahead
-        if stop <= self._behind:
-            self._waiting, self._felt = rows, felt
+        force = np.concatenate([self._force, force])
+        stop = len(rows) - self._after
+        if stop <= self._before:
+            self._waiting, self._force = rows, force
             return rows[:0]
-        out = rows[self._behind : stop].copy()
-        moved = np.zeros((len(out), 3))
+        out = rows[self._before : stop].copy()
+        shifted = np.zeros((len(out), 3))
         for weight, offset in zip(self._weights, self._offsets, strict=True):
-            moved += weight * felt[self._behind + offset : stop + offset]
-        out["dv_b"] = moved - out["dv_b"]
-        self._waiting, self._felt = rows[stop - self._behind :].copy(), felt[stop - self._behind :].copy()
+            shifted += weight * force[self._before + offset : stop + offset]
+        out["dv_b"] = shifted - out["dv_b"]
+        self._waiting, self._force = rows[stop - self._before :].copy(), force[stop - self._before :].copy()
         return out

@@ -18,43 +18,43 @@ from imudrv.nav.alignment import ALIGNMENT_S, Aligned
 from imudrv.site import Site
 from imudrv.wire.layout import Layout
 
-Expected: TypeAlias = Literal["smaller", "same"]
+Expected: TypeAlias = Literal["reduced", "unchanged"]
 
 
 FAST_DEG_PER_S: Final = 10.0
-"""A motion whose peak rate is above this is a fast one."""
+"""Peak rate above which a motion is fast."""
 
 
 RATE_FILTER: Final[RateFilterName] = "centred"
-"""For the size effect, unless another is asked for; `causal` amplifies what the dither does to the case."""
+"""Default rate filter for the size effect; `causal` would amplify the dither of the case."""
 
 
 FIRST_S: Final = 1.0
-"""The mean velocity over so long after the motion is judged, s."""
+"""Averaging window for the velocity after the motion, s."""
 
 
 BEFORE_S: Final = 5.0
-"""Least rest between alignment and motion, s."""
+"""Minimum rest between alignment and motion, s."""
 
 
 @dataclass(frozen=True)
 class TrialSettings:
-    """How pulses become velocities.
+    """Settings for navigating a trial.
 
     Attributes
     ----------
     layout : Layout
-        Of the profile.
+        Layout of the profile.
     calibration : Calibration
-        With lever arms, in any gauge.
+        Calibration with lever arms, in any gauge.
     site : Site
-        Where the unit stands.
+        Site of the unit.
     align_s : float
-        Length of the alignment.
+        Length of the alignment, s.
     rate_filter : str
-        For the size effect.
+        Rate filter for the size effect.
     skew_s : float
-        By how much the accelerometers' sample ends later than the gyros', which is put right.
+        Time by which the accelerometer samples end later than those of the gyros, s; is corrected.
     """
 
     layout: Layout
@@ -64,22 +64,22 @@ class TrialSettings:
     rate_filter: RateFilterName = RATE_FILTER
     skew_s: float = 0.0
 
-    def known(self) -> Coefficients:
-        """The calibration, its lever arms told from their centroid."""
+    def coefficients(self) -> Coefficients:
+        """Return the coefficients of the calibration, with lever arms from their centroid."""
         r_b = convert(lever_arms_of(self.calibration, "validation"), "centroid").r_b
         return replace(coefficients(self.calibration), r_b=r_b)
 
 
 @dataclass(frozen=True)
 class NavigatedVelocity:
-    """One navigation.
+    """Result of one navigation.
 
     Attributes
     ----------
     aligned : Aligned
-        Where it starts.
+        Initial attitude.
     v_n : ndarray, shape (n, 3)
-        Velocity over ground, means over each 20 ms, east, north, up, m/s.
+        Velocity over ground: east, north, up, m/s, mean over each 20 ms.
     """
 
     aligned: Aligned
@@ -93,21 +93,21 @@ class Trial:
     Attributes
     ----------
     name : str
-        How reports call it.
+        Name in reports.
     t_s : ndarray, shape (n,)
-        Time of the middle of each mean, from the end of the alignment.
-    normal, compensated : Course
-        Without and with.
-    twin : Course or None
-        The course of a unit without lever arms, all else equal; only a simulation has one.
+        Middle of each mean, s from the end of the alignment.
+    normal, compensated : NavigatedVelocity
+        Without and with compensation.
+    twin : NavigatedVelocity or None
+        Velocity of the same unit without lever arms; in simulations only.
     moved_s : tuple of 2 float, or None
-        First and last motion, on the time of `t_s`; None: all is rest.
+        Start of the first and end of the last motion, on the time scale of `t_s`; None: no motion.
     peak_deg_per_s : float
-        Largest rate, means over 20 ms.
+        Peak rate, of means over 20 ms.
     noise : Noise
-        Of the sensors, from the rests.
+        Noise of the sensors, estimated in the rests.
     gravity : float
-        m/s^2.
+        Gravity, m/s^2.
     """
 
     name: str
@@ -122,15 +122,15 @@ class Trial:
 
     @property
     def expected(self) -> Expected:
-        """What compensation should do to the velocity."""
-        return "smaller" if self.peak_deg_per_s > FAST_DEG_PER_S else "same"
+        """Required effect of compensation on the velocity."""
+        return "reduced" if self.peak_deg_per_s > FAST_DEG_PER_S else "unchanged"
 
     @property
     def before(self) -> NDArray[np.bool_]:
-        """Means of the rest before the motion."""
+        """Mask of the rest before the motion."""
         return self.t_s < (self.moved_s[0] - GUARD_S if self.moved_s else 0.0)
 
     @property
     def after(self) -> NDArray[np.bool_]:
-        """Means of the rest after the motion; without one, all."""
+        """Mask of the rest after the motion; without a motion, everything."""
         return self.t_s >= (self.moved_s[1] + GUARD_S if self.moved_s else 0.0)

@@ -11,36 +11,36 @@ from imudrv.arrays import Array
 from imudrv.nav.earth import SEMI_MAJOR_AXIS
 
 MIN_REDUCTION: Final = 0.95
-"""By so much compensation has to make the velocity after a fast motion smaller."""
+"""Required reduction of the velocity after a fast motion, as a fraction."""
 
 
 MAX_CHANGE: Final = 0.05
-"""So much of the velocity it may change where nothing turns fast."""
+"""Largest change of the velocity without fast rotation, as a fraction."""
 
 
 @dataclass(frozen=True)
 class TrialMetrics:
-    """A trial in figures; m/s, horizontal where it is not said otherwise.
+    """Metrics of a trial, m/s; of the horizontal velocity unless stated.
 
     Attributes
     ----------
-    expected : {'smaller', 'same'}
-        What compensation should do.
+    expected : {'reduced', 'unchanged'}
+        Required effect of compensation.
     before : tuple of 2 float
-        rms in the rest before the motion, without and with; NaN where there is none.
+        rms in the rest before the motion, without and with compensation; NaN without such a rest.
     first : tuple of 3 float
-        Speed of the mean velocity over the first second after the motion: without, with, and of the twin.
-        The twin's is NaN where there is none.
+        Speed of the mean velocity over the first second after the motion: without and with compensation,
+        and of the twin (NaN without a twin).
     first_n : ndarray, shape (2, 3)
-        That mean velocity, without and with: east, north, up.
+        That mean velocity without and with compensation: east, north, up.
     whole : tuple of 3 float
-        rms over the rest after the motion: without, with, and of the twin.
+        rms over the rest after the motion: without and with compensation, and of the twin.
     effect : tuple of 2 float
-        rms of the difference from the twin over that rest, without and with.
+        rms difference from the twin over that rest, without and with compensation.
     change : float
-        rms of the difference between with and without.
+        rms difference between with and without compensation.
     noise : float
-        What the sensors' noise makes of velocity meanwhile, rms.
+        rms velocity that the sensor noise causes over that rest.
     """
 
     expected: Expected
@@ -53,50 +53,50 @@ class TrialMetrics:
     noise: float
 
     @property
-    def smaller_by(self) -> float:
-        """By how much compensation makes the velocity right after the motion smaller; 1: all of it."""
+    def reduction(self) -> float:
+        """Reduction of the velocity after the motion by compensation, as a fraction."""
         return 1.0 - self.first[1] / self.first[0]
 
     @property
     def good(self) -> bool:
-        """Whether compensation does what it should."""
-        if self.expected == "smaller":
-            return self.smaller_by >= MIN_REDUCTION
+        """Whether compensation has the required effect."""
+        if self.expected == "reduced":
+            return self.reduction >= MIN_REDUCTION
         return self.change < min(MAX_CHANGE * self.whole[0], self.noise)
 
 
 def evaluate(trial: Trial) -> TrialMetrics:
-    """Put a trial into figures.
+    """Compute the metrics of a trial.
 
     Parameters
     ----------
     trial : Trial
-        As navigated.
+        The trial.
 
     Returns
     -------
-    Judged
+    TrialMetrics
     """
     after, before = trial.after, trial.before
     first = after & (trial.t_s < trial.t_s[after][0] + FIRST_S)
     v = trial.normal.v_n, trial.compensated.v_n
-    floor_v = np.full_like(v[0], np.nan) if trial.twin is None else trial.twin.v_n
-    mean = [one[first].mean(axis=0) for one in (*v, floor_v)]
+    twin_v = np.full_like(v[0], np.nan) if trial.twin is None else trial.twin.v_n
+    mean = [one[first].mean(axis=0) for one in (*v, twin_v)]
     noise = noise_velocity(trial.t_s[after], trial.noise, trial.gravity)
     return TrialMetrics(
         trial.expected,
         before=(_rms(v[0][before]), _rms(v[1][before])) if before.any() else (np.nan, np.nan),
         first=(_speed(mean[0]), _speed(mean[1]), _speed(mean[2])),
         first_n=np.array(mean[:2]),
-        whole=(_rms(v[0][after]), _rms(v[1][after]), _rms(floor_v[after])),
-        effect=(_rms((v[0] - floor_v)[after]), _rms((v[1] - floor_v)[after])),
+        whole=(_rms(v[0][after]), _rms(v[1][after]), _rms(twin_v[after])),
+        effect=(_rms((v[0] - twin_v)[after]), _rms((v[1] - twin_v)[after])),
         change=_rms((v[1] - v[0])[after]),
         noise=float(np.sqrt(2.0 * (noise**2).mean())),
     )
 
 
 def noise_velocity(t_s: Array, noise: Noise, gravity: float) -> Array:
-    """Velocity of an axis that noise makes in the time t, 1 sigma, m/s; see the module's text."""
+    """Return the velocity of one axis that noise causes in the time t, 1 sigma, m/s; see `navigate`."""
     W = (gravity / SEMI_MAJOR_AXIS) ** 0.5
     even, odd = 0.5 * t_s, np.sin(2.0 * W * t_s) / (4.0 * W)
     of_velocity, of_tilt = noise.velocity_walk, noise.angle_walk * gravity / W
@@ -109,5 +109,5 @@ def _speed(v_n: Array) -> float:
 
 
 def _rms(v_n: Array) -> float:
-    """Of the horizontal speed."""
+    """Return the rms horizontal speed."""
     return float(np.sqrt((v_n[:, :2] ** 2).sum(axis=1).mean()))

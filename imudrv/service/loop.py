@@ -32,7 +32,7 @@ from imudrv.service.latency import Latency
 from imudrv.service.port import PortSupervisor
 from imudrv.service.recordings import Recordings
 from imudrv.service.runtime import SignalFlags, SystemdNotifier, ask_realtime, frozen_gc
-from imudrv.service.settings import Settings, default_status_path
+from imudrv.service.settings import Settings
 from imudrv.service.status import (
     IncrementStatus,
     RejectedStatus,
@@ -41,7 +41,7 @@ from imudrv.service.status import (
     UnitStatus,
     temperatures,
 )
-from imudrv.service.status_socket import StatusServer
+from imudrv.service.status_socket import StatusServer, default_status_path
 from imudrv.service.warm_up import warm_up
 from imudrv.sinks import open_sink
 from imudrv.sinks.base import Batch, Sink

@@ -1,7 +1,5 @@
 """Settings of the live service: from a file, from the command line, or from both."""
 
-import os
-import tempfile
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -69,8 +67,3 @@ def load(path: Path | None, given: dict[str, Any]) -> Settings:
                 f"expected a settings file, or --port, --profile and --calibration; got no --{name}"
             )
     return parse(given, Settings, "command line")
-
-
-def default_status_path() -> Path:
-    """Return the default path of the status socket, in the user's runtime folder."""
-    return Path(os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()) / "imu50.sock"

@@ -7,6 +7,7 @@ import json
 import os
 import socket
 import stat
+import tempfile
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
@@ -120,3 +121,8 @@ def ask(path: Path) -> dict[str, Any]:
     if not isinstance(status, dict) or (status.get("format"), status.get("version")) != (FORMAT, VERSION):
         raise InputError(f"{path}: expected {FORMAT} version {VERSION}, got {bytes(data[:40])!r}")
     return status
+
+
+def default_status_path() -> Path:
+    """Return the default path of the status socket: in the user's runtime folder."""
+    return Path(os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()) / "imu50.sock"

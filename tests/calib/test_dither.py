@@ -42,7 +42,7 @@ def dither(kind: tuple[list[float], list[float]], C_bg: Array = ALIGNED) -> Dith
     return in_increments(C_bg, np.array(amplitude) * ARCSEC, frequency, PHASES)
 
 
-def felt(d: Dither, C_ba: Array, t: Array) -> Array:
+def force_of(d: Dither, C_ba: Array, t: Array) -> Array:
     """Omega r along each accelerometer at times, plainly, shape (n, 3)."""
     W = 2.0 * np.pi * d.frequency_hz
     psi = np.multiply.outer(t, W) + d.phase_rad
@@ -76,7 +76,7 @@ def test_mean_and_lines_are_those_of_a_simulation_at_50_khz(kind, C_ba, C_bg):
     d = dither(kind, C_bg)
     lines = size_effect(d, C_ba, R_B)
     t = STEP * np.arange(round(PERIOD / STEP))
-    force = felt(d, C_ba, t)
+    force = force_of(d, C_ba, t)
     # Whole periods of lines far below 25 kHz: sums are integrals, to rounding of the 100 m/s^2 there are.
     largest = np.abs(force).max()
     np.testing.assert_allclose(lines.mean, force.mean(axis=0), rtol=1e-6, atol=1e-12 * largest)
@@ -95,7 +95,7 @@ def test_increments_are_integrals_of_a_simulation_at_50_khz(kind, C_ba, C_bg):
     edges = TAU * np.arange(round(PERIOD / TAU) + 1)
     integrals = np.array(
         [
-            simpson(felt(d, C_ba, np.linspace(a, b, round(TAU / STEP) + 1)), dx=STEP, axis=0)
+            simpson(force_of(d, C_ba, np.linspace(a, b, round(TAU / STEP) + 1)), dx=STEP, axis=0)
             for a, b in pairwise(edges)
         ]
     )
@@ -104,10 +104,10 @@ def test_increments_are_integrals_of_a_simulation_at_50_khz(kind, C_ba, C_bg):
     # Simpson's rule of 400 Hz at 50 kHz is good to (0.05)^4 / 180 = 4e-8, of 800 Hz to 6e-7.
     scale = np.abs(integrals).max()
     np.testing.assert_allclose(TAU * lines.at(middles), integrals, rtol=0.0, atol=1e-6 * scale)
-    # Among the samples the lines stand where they are seen, and give the same values.
-    seen = lines.seen(TAU)
-    assert seen.frequency_hz.max() <= 500.0
-    np.testing.assert_allclose(seen.at(middles), lines.at(middles), rtol=0.0, atol=1e-9 * scale / TAU)
+    # The aliases have the same values at the samples.
+    aliases = lines.aliased(TAU)
+    assert aliases.frequency_hz.max() <= 500.0
+    np.testing.assert_allclose(aliases.at(middles), lines.at(middles), rtol=0.0, atol=1e-9 * scale / TAU)
 
 
 def test_one_gyro_about_x_is_the_literature_and_its_mean_half_the_square_of_the_rate_times_the_arm():
@@ -129,24 +129,24 @@ def test_one_gyro_about_x_is_the_literature_and_its_mean_half_the_square_of_the_
     np.testing.assert_allclose(lines.mean, -0.5 * A**2 * np.array([0.0, R_B[1, 1], R_B[2, 2]]), rtol=1e-12)
 
 
-def test_twice_400_hz_is_seen_at_200_hz_and_differences_where_they_are():
-    lines = size_effect(dither(THREE), MISALIGNED, R_B).averaged(TAU).seen(TAU)
-    seen = dict(zip(lines.names, lines.frequency_hz.tolist(), strict=True))
-    assert {name: seen[name] for name in ("Wx", "Wy", "Wz")} == {"Wx": 400.0, "Wy": 405.0, "Wz": 395.0}
-    assert (seen["2 Wx, Wy+Wz"], seen["2 Wy"], seen["2 Wz"]) == (200.0, 190.0, 210.0)
-    assert (seen["Wx+Wy"], seen["Wx+Wz"]) == (195.0, 205.0)
-    assert (seen["Wx-Wy, Wx-Wz"], seen["Wy-Wz"]) == (5.0, 10.0)
-    assert len(seen) == 11
+def test_twice_400_hz_is_aliased_to_200_hz_and_differences_stay():
+    lines = size_effect(dither(THREE), MISALIGNED, R_B).averaged(TAU).aliased(TAU)
+    aliases = dict(zip(lines.names, lines.frequency_hz.tolist(), strict=True))
+    assert {name: aliases[name] for name in ("Wx", "Wy", "Wz")} == {"Wx": 400.0, "Wy": 405.0, "Wz": 395.0}
+    assert (aliases["2 Wx, Wy+Wz"], aliases["2 Wy"], aliases["2 Wz"]) == (200.0, 190.0, 210.0)
+    assert (aliases["Wx+Wy"], aliases["Wx+Wz"]) == (195.0, 205.0)
+    assert (aliases["Wx-Wy, Wx-Wz"], aliases["Wy-Wz"]) == (5.0, 10.0)
+    assert len(aliases) == 11
 
 
-def test_a_line_at_the_sample_rate_is_seen_as_a_mean_but_increments_hold_nothing_of_it():
+def test_a_line_at_the_sample_rate_is_aliased_to_the_mean_but_is_not_in_increments():
     lines = size_effect(dither(([150.0, 0.0, 0.0], [500.0] * 3)), ALIGNED, R_B)
-    rates = lines.seen(TAU)
+    rates = lines.aliased(TAU)
     assert abs(rates.mean[1]) != pytest.approx(abs(lines.mean[1]), rel=0.01)
-    np.testing.assert_allclose(lines.averaged(TAU).seen(TAU).mean, lines.mean, rtol=1e-12)
+    np.testing.assert_allclose(lines.averaged(TAU).aliased(TAU).mean, lines.mean, rtol=1e-12)
 
 
-def taken_off(d: Dither, C_ba: Array, C_bg: Array, name: str) -> tuple[Array, Array]:
+def subtracted(d: Dither, C_ba: Array, C_bg: Array, name: str) -> tuple[Array, Array]:
     """Middles of intervals, and what the compensator takes off each accelerometer there, m/s^2."""
     fine = 1e-13  # rad a pulse: rounding is 1e-9 of the dither
     c = Coefficients(
@@ -178,21 +178,21 @@ def taken_off(d: Dither, C_ba: Array, C_bg: Array, name: str) -> tuple[Array, Ar
 
 @CASES
 @pytest.mark.parametrize("name", NAMES)
-def test_the_compensator_takes_off_what_the_formula_says(kind, C_ba, C_bg, name):
+def test_the_compensator_subtracts_what_the_formula_gives(kind, C_ba, C_bg, name):
     d = dither(kind, C_bg)
-    t, got = taken_off(d, C_ba, C_bg, name)
+    t, got = subtracted(d, C_ba, C_bg, name)
     lines = compensated(d, C_ba, R_B, FILTERS[name], TAU)
     # Pulses of 1e-13 rad in second differences on arms of 40 mm: 1e-8 m/s^2.
     np.testing.assert_allclose(lines.at(t), got, rtol=1e-6, atol=3e-8)
-    np.testing.assert_allclose(lines.seen(TAU).at(t), got, rtol=1e-6, atol=3e-8)
-    np.testing.assert_allclose(lines.seen(TAU).mean, got.mean(axis=0), rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(lines.aliased(TAU).at(t), got, rtol=1e-6, atol=3e-8)
+    np.testing.assert_allclose(lines.aliased(TAU).mean, got.mean(axis=0), rtol=1e-6, atol=1e-9)
 
 
 def rectified_ug(name: str, arcsec: float, fraction: float = 1.0) -> float:
     """Mean that one gyro x puts on an accelerometer y with its arm of 30 mm along it."""
     d = in_increments(ALIGNED, [fraction * arcsec * ARCSEC, 0.0, 0.0], [400.0] * 3)
     arms = np.diag([30.0, 30.0, 30.0]) * MM
-    return float(compensated(d, ALIGNED, arms, FILTERS[name], TAU).seen(TAU).mean[1]) / UG
+    return float(compensated(d, ALIGNED, arms, FILTERS[name], TAU).aliased(TAU).mean[1]) / UG
 
 
 def test_raw_dither_through_causal_makes_milligs_and_the_case_reaction_less_than_a_microg():
@@ -210,14 +210,14 @@ def test_raw_dither_through_causal_makes_milligs_and_the_case_reaction_less_than
 
 
 @pytest.mark.parametrize("frequency_hz", [370.0, 385.0, 400.0, 415.0, 430.0])
-def test_the_dither_filter_lets_less_than_a_microg_of_the_raw_dither_through(frequency_hz):
+def test_the_dither_filter_passes_less_than_a_microg_of_the_raw_dither(frequency_hz):
     frequencies = [frequency_hz, 405.0, 395.0]
     d = in_increments(ALIGNED, np.full(3, 180.0) * ARCSEC, frequencies, PHASES)
     arms = np.full((3, 3), 30.0) * MM
-    lines = compensated(d, ALIGNED, arms, FILTERS["dither"], TAU).seen(TAU)
-    assert np.abs(lines.mean).max() < 1e-6 * UG  # what is left of squares: 20 mg times the square of 4e-9
-    assert lines.amplitude.max() * TAU < 5e-9  # m/s a sample; what is left of the tangential 1e-1
-    _, got = taken_off(d, ALIGNED, ALIGNED, "dither")
+    lines = compensated(d, ALIGNED, arms, FILTERS["dither"], TAU).aliased(TAU)
+    assert np.abs(lines.mean).max() < 1e-6 * UG  # residual of squares: 20 mg times the square of 4e-9
+    assert lines.amplitude.max() * TAU < 5e-9  # m/s a sample; of a tangential 1e-1
+    _, got = subtracted(d, ALIGNED, ALIGNED, "dither")
     assert np.abs(got.mean(axis=0)).max() < 1e-2 * UG  # rounding of pulses of 1e-13 rad
 
 
@@ -236,7 +236,7 @@ def unit(r_mm: dict[str, list[float]] | None) -> Calibration:
     return Calibration.model_validate_json(json.dumps(document))
 
 
-def test_the_text_tells_means_lines_aliases_and_what_each_filter_lets_through():
+def test_the_text_has_means_lines_aliases_and_what_each_filter_passes():
     calibration = unit({"x": [24, -11, -9], "y": [-23, 29, -7], "z": [-1, -18, 16]})
     text = dither_text(calibration, THREE[0], THREE[1], list(FILTERS.values()), TAU)
     words = [line.split() for line in text.splitlines()]
@@ -244,9 +244,9 @@ def test_the_text_tells_means_lines_aliases_and_what_each_filter_lets_through():
     d = in_increments(ALIGNED, np.array(THREE[0]) * ARCSEC, THREE[1])
     expected = -compensated(d, ALIGNED, R_B, FILTERS["causal"], TAU).mean / UG
     np.testing.assert_allclose([float(w) for w in false_causal[3:6]], expected, rtol=5e-3)  # three digits
-    assert "800 Hz   200 Hz   keep 0.234" in text
-    assert "one frequency" not in text
-    assert "one frequency" in dither_text(calibration, *EQUAL, [], TAU)
+    assert "800 Hz   200 Hz        0.234" in text
+    assert "the same frequency" not in text
+    assert "the same frequency" in dither_text(calibration, *EQUAL, [], TAU)
 
 
 def test_a_unit_without_arms_is_refused():

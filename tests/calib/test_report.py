@@ -13,7 +13,8 @@ from rich.cells import cell_len
 from calib.estimation.result import LeaveOneOut
 from calib.identification import IdentificationResult, PriorCalibration, identify
 from calib.lever_arms.gauge import LeverArms, convert
-from calib.reports.identification import arms_text, report_html, report_text, verdict
+from calib.reports.identification import arms_text, document, report_html, verdict
+from calib.reports.text import as_text
 from imudrv.cli import main as imudrv
 from imudrv.sim.scenario import NOMINAL
 from imudrv.site import Site
@@ -114,13 +115,13 @@ def test_what_comes_from_files_is_escaped(
     assert "&lt;img src=x onerror=alert(1)&gt;&amp;" in page
     assert "50&lt;b&gt;&amp;17" in page
     assert "\x1b" not in page
-    assert "\x1b" not in report_text(findings, arms)
+    assert "\x1b" not in as_text(document(findings, arms))
 
 
 def test_the_text_fits_80_columns_whatever_the_names(
     findings: IdentificationResult, arms: tuple[LeverArms, LeverArms]
 ) -> None:
-    text = report_text(findings, arms)
+    text = as_text(document(findings, arms))
     assert max(map(cell_len, text.splitlines())) <= 80
     assert not re.search(r"[ \t]$", text, re.MULTILINE)
     assert 60 * "z" in re.sub(r"\s", "", text)  # folded, not cut
@@ -132,18 +133,18 @@ def test_a_report_is_a_function_of_the_findings(
     assert report_html(findings, arms) == page
 
 
-def test_text_and_page_tell_the_same_numbers(
+def test_text_and_page_show_the_same_numbers(
     page: str, findings: IdentificationResult, arms: tuple[LeverArms, LeverArms]
 ) -> None:
     numbers = re.compile(r"[+-]\d+\.\d+")
     body = re.sub(r'src="[^"]*"|<style>.*</style>', "", page, flags=re.DOTALL)
-    assert set(numbers.findall(report_text(findings, arms))) == set(numbers.findall(body))
+    assert set(numbers.findall(as_text(document(findings, arms)))) == set(numbers.findall(body))
 
 
-def test_nine_numbers_never_stand_without_their_gauge(
+def test_lever_arms_are_always_shown_with_their_gauge(
     findings: IdentificationResult, arms: tuple[LeverArms, LeverArms]
 ) -> None:
-    text = report_text(findings, arms)
+    text = as_text(document(findings, arms))
     heads = [line for line in text.splitlines() if line.startswith("  Sensing points in body axes")]
     assert heads == [f"  Sensing points in body axes, mm, gauge {gauge}" for gauge in ("centroid", "x")]
     assert len(re.findall(r"^  r_x  ", text, re.MULTILINE)) == 2
@@ -151,11 +152,11 @@ def test_nine_numbers_never_stand_without_their_gauge(
     assert "gauge x" in arms_text(LeverArms(arms[1].r_b, None, "x"))
 
 
-def test_every_rotation_is_told_with_verdict_or_reason(
+def test_every_rotation_has_a_verdict_or_a_reason_for_rejection(
     findings: IdentificationResult, arms: tuple[LeverArms, LeverArms]
 ) -> None:
-    text = " ".join(report_text(findings, arms).split())
-    assert text.count("serves: within all limits") == 3
+    text = " ".join(as_text(document(findings, arms)).split())
+    assert text.count("accepted: within all limits") == 3
     assert text.count("turned 30.0 deg, want 180 +- 5") == 3
 
 
@@ -170,7 +171,7 @@ def test_the_verdict_is_bad_where_the_data_contradict_the_model(findings: Identi
     assert "No certificate is made" in marks[3.0][1]
 
 
-def test_increments_that_carry_dither_are_bad_with_the_remedy(findings: IdentificationResult) -> None:
+def test_dither_in_the_increments_is_a_bad_verdict_with_the_remedy(findings: IdentificationResult) -> None:
     runs = findings.result.runs
     shaken = replace(findings.result, runs=(replace(runs[0], H_rest=0.07), *runs[1:]))
     bad = [text for mark, text in verdict(replace(findings, result=shaken)) if mark == "bad"]
@@ -180,23 +181,23 @@ def test_increments_that_carry_dither_are_bad_with_the_remedy(findings: Identifi
     assert "let the unit remove its dither" in bad[0]
 
 
-def test_three_rotations_end_without_a_caution_that_is_not_true(findings: IdentificationResult) -> None:
+def test_three_rotations_give_no_false_caution(findings: IdentificationResult) -> None:
     marks = list(verdict(findings))
     assert {mark for mark, _ in marks} == {"good", "note"}
     notes = " ".join(text for mark, text in marks if mark == "note")
-    assert "determined, not checked: no redundant rotation" in notes
-    assert "allow for one of 0.5 ms" in notes
+    assert "determined but not checked: no rotation is redundant" in notes
+    assert "include one of 0.5 ms" in notes
     assert "agree with the model" not in " ".join(text for _, text in marks)
 
 
-def test_a_rotation_that_could_be_left_out_is_told_with_its_change(findings: IdentificationResult) -> None:
+def test_the_change_without_a_redundant_rotation_is_reported(findings: IdentificationResult) -> None:
     shift = np.zeros((3, 3))
     shift[1, 2] = -0.02 * MM
     result = replace(
         findings.result, leave_one_out=(LeaveOneOut("z#1", 6, shift), LeaveOneOut("x#1", 4, None))
     )
-    told = [text for mark, text in verdict(replace(findings, result=result)) if mark == "note"]
-    assert told[0] == "Leaving out one rotation changes no component by more than 0.020 mm (z#1)."
+    notes = [text for mark, text in verdict(replace(findings, result=result)) if mark == "note"]
+    assert notes[0] == "Omitting one rotation changes no component by more than 0.020 mm (z#1)."
 
 
 def test_digits_follow_the_uncertainty(findings: IdentificationResult) -> None:

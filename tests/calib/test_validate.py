@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from calib.certificate import lever_arms_of
-from calib.cli.main import main as calib
+from calib.cli import main as calib
 from calib.detection.noise import Noise
 from calib.lever_arms.gauge import GAUGES, convert
 from calib.reports.html import as_html
@@ -74,53 +74,53 @@ def test_the_unit_differs_from_its_calibration_and_the_arms_are_not_the_true_one
     assert 1e-4 < np.sqrt((error**2).mean()) < 0.1
 
 
-def test_half_a_turn_leaves_less_than_a_twentieth_of_the_velocity(
+def test_a_rotation_by_180_deg_leaves_less_than_a_twentieth_of_the_velocity(
     rotation: tuple[Trial, TrialMetrics],
 ) -> None:
-    made, judged = rotation
-    assert judged.expected == "smaller"
-    assert judged.first[0] > 100 * MM  # 8.8 / 2.5 m/s a metre, arms of 30 mm
-    assert judged.smaller_by >= 0.95  # the requirement
-    assert judged.good
+    made, metrics = rotation
+    assert metrics.expected == "reduced"
+    assert metrics.first[0] > 100 * MM  # 8.8 / 2.5 m/s a metre, arms of 30 mm
+    assert metrics.reduction >= 0.95  # the requirement
+    assert metrics.good
     # 2.5 s later the trial is at rest again; the guard of segments is a block or two
     assert made.moved_s == pytest.approx((10.0, 12.5), abs=0.1)
     # what biases, tilts and noise leave is in the twin too: beside it the arms' share is a hundredth
-    assert judged.effect[1] < 0.01 * judged.effect[0]
+    assert metrics.effect[1] < 0.01 * metrics.effect[0]
 
 
 def test_fierce_rocking_leaves_less_than_a_twentieth_of_the_velocity(who: SimulatedUnit) -> None:
-    made, judged = tried("rocking", who)
+    made, metrics = tried("rocking", who)
     assert made.peak_deg_per_s > 50.0
-    assert judged.first[0] > 500 * MM  # omega^2 r over two minutes
-    assert judged.smaller_by >= 0.95  # the requirement
-    assert judged.effect[1] < 0.01 * judged.effect[0]
+    assert metrics.first[0] > 500 * MM  # omega^2 r over two minutes
+    assert metrics.reduction >= 0.95  # the requirement
+    assert metrics.effect[1] < 0.01 * metrics.effect[0]
 
 
 def test_vibration_is_not_changed(who: SimulatedUnit) -> None:
-    made, judged = tried("vibration", who)
-    assert made.expected == "same"
-    assert judged.change < 0.05 * judged.whole[0]  # the requirement, and the next
-    assert judged.change < judged.noise
-    assert judged.good
+    made, metrics = tried("vibration", who)
+    assert made.expected == "unchanged"
+    assert metrics.change < 0.05 * metrics.whole[0]  # the requirement, and the next
+    assert metrics.change < metrics.noise
+    assert metrics.good
 
 
 def test_rest_is_not_changed(who: SimulatedUnit) -> None:
     still = scenario("static", ALIGN_S)
     still = still.model_copy(update={"motion": (Segment(rest=Rest(duration_s=ALIGN_S + 120.0)),)})
     made = trial("static", still, who, 1, align_s=ALIGN_S)
-    judged = evaluate(made)
+    metrics = evaluate(made)
     assert made.moved_s is None
     assert made.after.all()
-    assert np.isnan(judged.before).all()
-    assert judged.change < 0.05 * judged.whole[0]  # the requirement, and the next
-    assert judged.change < judged.noise
+    assert np.isnan(metrics.before).all()
+    assert metrics.change < 0.05 * metrics.whole[0]  # the requirement, and the next
+    assert metrics.change < metrics.noise
 
 
-def test_arms_that_are_wrong_are_found_out(who: SimulatedUnit, rotation: tuple[Trial, TrialMetrics]) -> None:
+def test_wrong_arms_get_a_bad_verdict(who: SimulatedUnit, rotation: tuple[Trial, TrialMetrics]) -> None:
     wrong = who.found.model_copy(update={"size_effect": _turned(who)})
-    judged = tried("rotation", replace(who, found=wrong))[1]
-    assert not judged.good
-    assert judged.smaller_by == pytest.approx(-1.0, abs=0.05)  # twice as much as without
+    metrics = tried("rotation", replace(who, found=wrong))[1]
+    assert not metrics.good
+    assert metrics.reduction == pytest.approx(-1.0, abs=0.05)  # twice as much as without
 
 
 def _turned(who: SimulatedUnit) -> SizeEffect:
@@ -170,7 +170,7 @@ def _pulses(of: Scenario) -> Iterator[Records]:
         yield chunk.pulses
 
 
-def test_a_skew_is_estimated_with_a_rocking_and_put_right() -> None:
+def test_a_skew_is_estimated_with_a_rocking_and_corrected() -> None:
     made = short("rocking")
     unit = made.unit.model_copy(update={"accelerometer_skew_s": 1e-3})
     made = made.model_copy(update={"unit": unit})
@@ -181,7 +181,7 @@ def test_a_skew_is_estimated_with_a_rocking_and_put_right() -> None:
     ignored, right = (
         evaluate(trial("rocking", made, who, 2, align_s=ALIGN_S, skew_s=s)) for s in (0.0, who.skew_s)
     )
-    # 1 ms is 1 to 2 % of the effect here; what is left of it follows the estimate's error
+    # 1 ms is 1 to 2 % of the effect here; the residual follows the error of the estimate
     assert ignored.effect[1] > 0.008 * ignored.effect[0]
     assert right.effect[1] < 0.5 * ignored.effect[1]
 
@@ -208,7 +208,7 @@ def test_noise_of_velocity_grows_as_random_walks_do_and_swings_with_schuler() ->
     noise = Noise(angle_walk=6e-7, velocity_walk=5e-5, velocity_white=0.0, velocity_pulse=0.0)
     t_s = np.array([10.0, 60.0])
     of_velocity, of_tilt = 5e-5 * t_s**0.5, 9.8 * 6e-7 * (t_s**3 / 3.0) ** 0.5
-    # Schuler's period is 84 min: its first term left out is (W t)^2, 6e-3 after a minute
+    # Schuler's period is 84 min: the first neglected term is (W t)^2, 6e-3 after a minute
     np.testing.assert_allclose(noise_velocity(t_s, noise, 9.8), np.hypot(of_velocity, of_tilt), rtol=6e-3)
     rng = np.random.default_rng(1)
     dt, n, W2 = 10.0, 360, 9.8 / 6378137.0
@@ -220,7 +220,7 @@ def test_noise_of_velocity_grows_as_random_walks_do_and_swings_with_schuler() ->
     assert noise_velocity(np.array([3600.0]), noise, 9.8)[0] == pytest.approx(v.std(), rel=0.025)
 
 
-def test_a_rest_that_is_too_short_is_told_with_what_to_do(who: SimulatedUnit) -> None:
+def test_a_rest_that_is_too_short_is_reported_with_the_remedy(who: SimulatedUnit) -> None:
     made = short("rotation", 3.0)
     setting = TrialSettings(LAYOUT, who.found, made.site, ALIGN_S + 8.0)
     with pytest.raises(InputError, match=r"run: expected a rest of 73 s at the beginning, .* got 70\.0 s"):
@@ -232,7 +232,7 @@ def test_a_rest_that_is_too_short_is_told_with_what_to_do(who: SimulatedUnit) ->
         navigate("run", _pulses(still_turning), replace(setting, align_s=ALIGN_S))
 
 
-def test_a_skew_is_not_put_right_over_a_gap(who: SimulatedUnit) -> None:
+def test_a_skew_is_not_corrected_over_a_gap(who: SimulatedUnit) -> None:
     pulses = np.concatenate(list(_pulses(short("rotation", 3.0))))
     pulses["flags"][30_000] |= Flag.MISSING_BEFORE
     setting = TrialSettings(LAYOUT, who.found, scenario("rotation").site, ALIGN_S, skew_s=1e-3)
@@ -251,13 +251,13 @@ def test_a_campaign_gives_each_unit_its_trials(monkeypatch: pytest.MonkeyPatch, 
     assert (made[0].normal.v_n != made[1].normal.v_n).any()
 
 
-def test_the_report_tells_verdict_figures_and_both_courses(rotation: tuple[Trial, TrialMetrics]) -> None:
-    made, judged = rotation
-    bad = replace(made, name="<b>slow</b>\x1b[31m"), replace(judged, first=(0.1, 0.2, np.nan))
-    told = document("unit <7>", [rotation, bad], drawn=1)
-    text, page = as_text(told), as_html(told)
+def test_the_report_has_verdict_figures_and_both_navigations(rotation: tuple[Trial, TrialMetrics]) -> None:
+    made, metrics = rotation
+    bad = replace(made, name="<b>slow</b>\x1b[31m"), replace(metrics, first=(0.1, 0.2, np.nan))
+    report = document("unit <7>", [rotation, bad], drawn=1)
+    text, page = as_text(report), as_html(report)
     assert max(map(len, text.splitlines())) <= 80
-    assert f"{judged.smaller_by:.2%} smaller, want 95%" in " ".join(text.split())
+    assert f"reduced by {metrics.reduction:.2%}, required 95%" in " ".join(text.split())
     assert "good  rotation" in text
     assert "bad   <b>slow" in text
     assert "\x1b" not in text
@@ -267,7 +267,7 @@ def test_the_report_tells_verdict_figures_and_both_courses(rotation: tuple[Trial
     assert 'src="data:image/svg+xml' in page
 
 
-def test_a_recorded_run_is_judged_by_the_command(
+def test_a_recorded_run_is_metrics_by_the_command(
     who: SimulatedUnit, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     made = short("rotation", 3.0)

@@ -1,0 +1,28 @@
+"""The command `imudrv`: each module is the command of its name; `arguments` and `capture` are shared.
+
+A module is imported when its command is called, see `imudrv.terminal.run_program`.
+"""
+
+from collections.abc import Sequence
+from typing import Final
+
+from imudrv.terminal import run_program
+
+COMMANDS: Final = {
+    "demo": "Demonstrate service, bench procedure, certificate and verification on a simulated unit.",
+    "doctor": "Diagnose why no data arrive from a unit, and say what to do.",
+    "run": "Run the live service: data of a unit in, compensated increments out.",
+    "monitor": "Show a running service on the terminal.",
+    "status": "Print the health of a running service; exit code 0 ok, 3 warning, 4 failure.",
+    "decode": "Decode a capture to pulse increments.",
+    "compensate": "Compensate a capture: increments in body axes.",
+    "export": "Convert a recording to another format.",
+    "pack": "Compress a recording.",
+    "sim": "Simulate a unit: to a capture, or live on a port.",
+    "check": "Check a calibration, site, profile, scenario or settings file.",
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run `imudrv` with some arguments, those of the process if None; return the exit code."""
+    return run_program(__name__, "Driver of a 50-type ring-laser-gyro IMU.", COMMANDS, argv)

@@ -1,0 +1,36 @@
+"""The capture that `decode` and `compensate` read, and the summary of its losses."""
+
+import argparse
+from pathlib import Path
+
+from imudrv import profiles
+from imudrv.capture import Capture
+from imudrv.cli.arguments import add_profile, message_stream
+
+
+def add_capture(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments that `open_capture` takes."""
+    text = "wire bytes, a candump log, or a recording (.mcap), which contains its profile"
+    parser.add_argument("capture", type=Path, help=text)
+    add_profile(parser)
+    parser.add_argument("--channel", metavar="NAME", help="CAN channel of a candump log, such as can0")
+
+
+def open_capture(arguments: argparse.Namespace) -> Capture:
+    """Open the capture that the arguments name."""
+    profile = profiles.load(arguments.profile) if arguments.profile else None
+    return Capture(arguments.capture, profile, arguments.channel)
+
+
+def print_losses(capture: Capture, output: Path) -> None:
+    """Print what was read, and which samples and bytes were lost or rejected."""
+    stream = message_stream(output)
+    print(f"{capture.path}: {capture.layout.name}, {capture.size} bytes -> {output}", file=stream)
+    print(f"  {capture.tracker.counts}", file=stream)
+    for reason, rejected in sorted(capture.rejected.items()):
+        name = reason.name.lower().replace("_", " ")
+        first = ", ".join(map(str, rejected.first))
+        more = ", ..." if rejected.runs > len(rejected.first) else ""
+        print(f"  {name}: {rejected.runs} x, {rejected.length} in all, at {first}{more}", file=stream)
+    for channel, messages in list(capture.channels.items())[1:]:
+        print(f"  ignored: {messages} messages of channel {channel}", file=stream)

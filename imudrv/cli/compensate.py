@@ -1,0 +1,61 @@
+"""Command `imudrv compensate`."""
+
+import argparse
+from pathlib import Path
+from typing import Final
+
+from imudrv.calibration import coefficients, read_calibration_file, require_unit
+from imudrv.cli.arguments import add_output, message_stream
+from imudrv.cli.capture import add_capture, open_capture, print_losses
+from imudrv.errors import InputError
+from imudrv.files.outputs import require_other
+from imudrv.files.tables import increment_columns, table
+from imudrv.imu.compensation import Compensator
+from imudrv.imu.rate_filter import NAMES, rate_filter
+from imudrv.terminal import progress
+
+EXAMPLE: Final = "z-up.raw --profile imu50-rs422 --calibration unit.yaml -o increments.npz"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    add_capture(parser)
+    text = "calibration of the unit; default: the one in the recording"
+    parser.add_argument("--calibration", type=Path, metavar="C.yaml", help=text)
+    text = "serial number of the unit; the calibration of another unit is rejected"
+    parser.add_argument("--unit", metavar="SERIAL", help=text)
+    text = "angular rate for the size effect (default: causal)"
+    parser.add_argument("--rate-filter", choices=NAMES, default="causal", help=text)
+    add_output(parser, "NAME.csv, NAME.npz or NAME.i50n; - for csv on standard output")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Write the compensated increments of a capture as a table."""
+    require_other(arguments.output, arguments.capture, arguments.profile, arguments.calibration)
+    capture = open_capture(arguments)
+    if arguments.calibration is not None:
+        file = read_calibration_file(arguments.calibration, arguments.unit)
+        calibration, origin = file.model, f"calibration {file.sha256[:12]}"
+    elif capture.recording is not None and (recorded := capture.recording.calibration) is not None:
+        require_unit(recorded, arguments.unit, str(arguments.capture))
+        calibration, origin = recorded, "calibration of the recording"
+    else:
+        raise InputError("expected --calibration: only a recording of the service contains a calibration")
+    layout, filter_name = capture.layout, arguments.rate_filter
+    compensator = Compensator(coefficients(calibration), layout, rate_filter(filter_name, layout.interval_ns))
+    with (
+        table(arguments.output, (".csv", ".npz", ".i50n"), {}) as rows,
+        progress("compensate", capture.size) as advance,
+    ):
+        for increments in capture.increments(compensator, advance):
+            rows.write(increment_columns(increments))
+    print_losses(capture, arguments.output)
+    stream = message_stream(arguments.output)
+    size_effect = (
+        "compensated" if calibration.size_effect else "not compensated: the calibration has no sensing points"
+    )
+    print(f"  unit {calibration.serial_number}, {origin}", file=stream)
+    print(
+        f"  size effect {size_effect}; rate filter {filter_name}, delay {compensator.lag} samples",
+        file=stream,
+    )

@@ -1,0 +1,24 @@
+"""Command `imudrv export`."""
+
+import argparse
+from pathlib import Path
+from typing import Final
+
+from imudrv.cli.arguments import add_output, message_stream
+from imudrv.recording.export import KINDS, export
+from imudrv.recording.reader import Recording
+
+EXAMPLE: Final = "run.mcap --to npz -o run.npz"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.add_argument("recording", type=Path)
+    parser.add_argument("--to", choices=KINDS, required=True, help="output format")
+    add_output(parser, "file to write; - for standard output with csv, raw, candump")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Write a recording in another format."""
+    export(Recording(arguments.recording), arguments.to, arguments.output)
+    print(f"{arguments.recording} -> {arguments.output}", file=message_stream(arguments.output))

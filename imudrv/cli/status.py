@@ -1,0 +1,27 @@
+"""Command `imudrv status`."""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Final
+
+from imudrv.service.status import EXIT_CODES
+from imudrv.service.status_socket import ask, default_status_path
+
+EXAMPLE: Final = "--json"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.add_argument("--status", type=Path, metavar="PATH", help="status socket of the service")
+    parser.add_argument("--json", action="store_true", help="the whole status as JSON")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print the status of a service; return the exit code of its health."""
+    status = ask(arguments.status or default_status_path())
+    if arguments.json:
+        print(json.dumps(status, indent=1))
+    else:
+        print("\n".join([status["health"], *status["reasons"]]))
+    return EXIT_CODES[status["health"]]
