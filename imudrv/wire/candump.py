@@ -20,7 +20,7 @@ from imudrv.wire.fields import Bytes
 LONGEST_LINE: Final = 256
 """Characters of a line, without its end; a longer one is no message."""
 MOST_CHANNELS: Final = 16
-"""Channels that are told apart by name, as many as candump itself listens to."""
+"""Channels that are distinguished by name, as many as candump itself listens to."""
 
 _NEWLINE, _TAB, _RETURN, _SPACE = ord("\n"), ord("\t"), ord("\r"), ord(" ")
 _OPEN, _CLOSE, _POINT, _HASH, _ZERO = ord("("), ord(")"), ord("."), ord("#"), ord("0")
