@@ -1,4 +1,4 @@
-"""Frames from what a unit's line carries, by its profile, and counts of what is no frame."""
+"""Decoder from wire data to frames by profile, with counts of rejected input."""
 
 from dataclasses import dataclass, field
 from typing import Final
@@ -112,7 +112,7 @@ class CaptureDecoder:
         return self._frames.rejected
 
     def feed(self, data: bytes | memoryview) -> Records:
-        """Take bytes in.
+        """Decode bytes.
 
         Parameters
         ----------
