@@ -181,7 +181,7 @@ class ClockModel:
         )
 
     def _make_room(self, count: int) -> None:
-        """Move what waits to a fresh array, with room for `count` more; stamps given out keep the old one."""
+        """Move queued stamps to a new array, with room for `count` more; returned stamps keep the old one."""
         waiting = self._stamps[max(self._taken, self._fed - _KEPT) : self._fed]
         self._stamps = np.empty(max(_ROOM, 2 * (len(waiting) + count)), STAMP)
         self._stamps[: len(waiting)] = waiting

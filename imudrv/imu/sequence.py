@@ -31,7 +31,7 @@ after losses. Beyond, the counter jumps. A jump backward is a restart."""
 
 @dataclass(frozen=True)
 class SampleCounts:
-    """Number of samples by what became of them; see the module."""
+    """Number of samples by outcome; see the module."""
 
     frames: int
     good: int
@@ -57,7 +57,7 @@ class SampleCounts:
 
     @property
     def lost(self) -> int:
-        """Samples that the unit numbered and that were not output."""
+        """Number of samples that were not output."""
         return self.damaged + self.torn + self.missing + self.out_of_order
 
     def __str__(self) -> str:

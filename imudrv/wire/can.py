@@ -28,7 +28,7 @@ CONSTANTS: Final = np.dtype(
     ],
     align=True,
 )
-"""Constants of a layout, beside its tables."""
+"""Constants of a layout, in addition to its tables."""
 
 SLOT: Final = np.dtype(
     [
@@ -105,7 +105,7 @@ class CanAssembler:
 
     @property
     def messages_fed(self) -> int:
-        """Messages fed since the beginning."""
+        """Number of messages fed so far."""
         return int(self._state[0]["index"])
 
     @property
@@ -130,7 +130,7 @@ class CanAssembler:
         return int(self._state[0]["disagreements"])
 
     def feed(self, messages: Records) -> Decoded:
-        """Take messages in.
+        """Decode messages.
 
         Parameters
         ----------
@@ -233,7 +233,7 @@ def _assemble(
 
 @kernel
 def _kind_of(identifier: int, kinds: Records) -> int:
-    """Row of the kind with this identifier; -1 for a foreign one."""
+    """Return the row of the kind with this identifier; -1 for an unknown one."""
     for k in range(kinds.shape[0]):
         if kinds[np.uint64(k)]["can_id"] == identifier:
             return k
@@ -358,13 +358,13 @@ def _advance(low: int, c: np.void, s: np.void) -> None:
 
 @kernel
 def _wrapped(counter: int, c: np.void) -> int:
-    """Counter modulo its full width."""
+    """Return the counter modulo its full width."""
     return int(counter & ((np.int64(1) << c["full_bits"]) - 1))
 
 
 @kernel
 def _restart(c: np.void, s: np.void, slots: Records, rejects: Records) -> None:
-    """The unit has restarted: give up all open samples, release the held frames, forget the rest."""
+    """Handle a restart of the unit: reject open samples, release held frames, reset the state."""
     for i in range(OPEN_SAMPLES):
         _give_up(slots[i], s, rejects)
     s["released"] = s["found"]
@@ -373,7 +373,7 @@ def _restart(c: np.void, s: np.void, slots: Records, rejects: Records) -> None:
 
 @kernel
 def _forget(c: np.void, s: np.void) -> None:
-    """Know nothing of the unit any more; counts stay."""
+    """Reset the state of the unit; counts stay."""
     s["counter"], s["has_sample"], s["is_anchored"] = 0, False, c["hold"] == 0
     s["latest"]["status"] = 0
     for channel in range(MAX_TEMPERATURES):
@@ -382,7 +382,7 @@ def _forget(c: np.void, s: np.void) -> None:
 
 @kernel
 def _release(c: np.void, s: np.void) -> None:
-    """Let the frames go if their full counter is known, or has been waited for long enough."""
+    """Release the frames if their full counter is known, or has not arrived in time."""
     if s["found"] - s["released"] > c["hold"]:
         s["is_anchored"] = True
     if s["is_anchored"]:

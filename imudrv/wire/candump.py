@@ -18,9 +18,9 @@ from imudrv.units import NS_PER_S
 from imudrv.wire.fields import Bytes
 
 LONGEST_LINE: Final = 256
-"""Characters of a line, without its end; a longer one is no message."""
+"""Maximum number of characters of a line without its newline; a longer line is no message."""
 MOST_CHANNELS: Final = 16
-"""Channels that are distinguished by name, as many as candump itself listens to."""
+"""Maximum number of channels distinguished by name, as in candump itself."""
 
 _NEWLINE, _TAB, _RETURN, _SPACE = ord("\n"), ord("\t"), ord("\r"), ord(" ")
 _OPEN, _CLOSE, _POINT, _HASH, _ZERO = ord("("), ord(")"), ord("."), ord("#"), ord("0")
@@ -69,12 +69,12 @@ class CandumpDecoder:
 
     @property
     def pending(self) -> int:
-        """Bytes of the last line, whose end has not come; at most `LONGEST_LINE` + 1 of them are kept."""
+        """Number of bytes of the unfinished last line; at most `LONGEST_LINE` + 1 of them are kept."""
         return self._line.size + self._cut
 
     @property
     def bytes_fed(self) -> int:
-        """Bytes fed since the beginning."""
+        """Number of bytes fed so far."""
         return self._offset + self.pending
 
     @property
@@ -112,7 +112,7 @@ class CandumpDecoder:
             )
 
     def feed(self, data: bytes | bytearray | memoryview | NDArray[np.uint8]) -> tuple[Records, Records]:
-        """Take text in.
+        """Decode text.
 
         Parameters
         ----------

@@ -128,7 +128,7 @@ class DatagramDecoder:
         self._tail = np.zeros(0, np.uint8)
 
     def feed(self, data: bytes | bytearray | memoryview) -> Received:
-        """Take bytes in.
+        """Decode bytes.
 
         Parameters
         ----------

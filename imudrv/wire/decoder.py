@@ -1,4 +1,4 @@
-"""Frames from what a unit's line carries, by its profile, and counts of what is no frame."""
+"""Decoder from wire data to frames by profile, with counts of rejected input."""
 
 from dataclasses import dataclass, field
 from typing import Final
@@ -59,12 +59,12 @@ class FrameDecoder:
         ndarray of FRAME
             The frames that became complete.
         """
-        if isinstance(self._decoder, CanAssembler):
-            assert isinstance(data, np.ndarray)
+        if isinstance(self._decoder, CanAssembler) and isinstance(data, np.ndarray):
             frames, rejects = self._decoder.feed(data)
-        else:
-            assert not isinstance(data, np.ndarray)
+        elif isinstance(self._decoder, StreamDecoder) and not isinstance(data, np.ndarray):
             frames, rejects = self._decoder.feed(data, t_ns)
+        else:
+            raise TypeError("expected CAN messages for a CAN profile, bytes for any other")
         if rejects.size:
             self.count_rejects(rejects)
         return frames
@@ -112,7 +112,7 @@ class CaptureDecoder:
         return self._frames.rejected
 
     def feed(self, data: bytes | memoryview) -> Records:
-        """Take bytes in.
+        """Decode bytes.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""Layout of the messages of one profile: all that decoding and encoding need to know."""
+"""Layout of the messages of one profile, for decoding and encoding."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -120,7 +120,7 @@ _NO_MASKS: Final = StatusMasks()
 
 @dataclass(frozen=True)
 class Layout:
-    """All that decoding needs to know of a profile.
+    """Layout of a profile.
 
     Parameters
     ----------

@@ -66,16 +66,16 @@ class StreamDecoder:
 
     @property
     def pending(self) -> int:
-        """Bytes that wait for the rest of their frame; fewer than one frame."""
+        """Number of bytes of an incomplete frame."""
         return self._pending
 
     @property
     def bytes_fed(self) -> int:
-        """Bytes fed since the beginning."""
+        """Number of bytes fed so far."""
         return int(self._state[0]["offset"]) + self._pending
 
     def feed(self, data: bytes | bytearray | memoryview | NDArray[np.uint8], t_ns: int = 0) -> Decoded:
-        """Take bytes in.
+        """Decode bytes.
 
         Parameters
         ----------
@@ -214,7 +214,7 @@ def _skip(s: np.void, offset: int, reason: int) -> None:
 
 @kernel
 def _close_reject(reject: np.void, s: np.void, end: int) -> None:
-    """Write down the open run of rejected bytes, which ends at this offset of the stream."""
+    """Add the open run of rejected bytes, which ends at this offset of the stream, to the rejects."""
     reject["offset"], reject["length"] = s["reject_offset"], end - s["reject_offset"]
     reject["reason"] = s["reject_reason"]
     s["reject_offset"] = -1

@@ -312,7 +312,7 @@ def test_gravity_absent_from_the_site_is_the_normal_one(scenario: Make) -> None:
 
 @pytest.mark.parametrize(
     ("interval_ns", "chunk", "message"),
-    [(0, 1, "10 us to 1 s, got 0 ns"), (MS, 0, "one sample at least, got 0")],
+    [(0, 1, "10 us to 1 s, got 0 ns"), (MS, 0, "at least one sample, got 0")],
 )
 def test_an_interval_or_chunk_without_sense_is_refused(
     scenario: Make, interval_ns: int, chunk: int, message: str
