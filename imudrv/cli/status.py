@@ -5,8 +5,7 @@ import json
 from pathlib import Path
 from typing import Final
 
-from imudrv.service.status import EXIT_CODES
-from imudrv.service.status_socket import ask, default_status_path
+from imudrv.service.status_socket import EXIT_CODES, ask, default_status_path
 
 EXAMPLE: Final = "--json"
 

@@ -11,15 +11,9 @@ from imudrv.imu.clock import ClockReport
 from imudrv.imu.sequence import SampleCounts
 from imudrv.records import Flag, Records
 from imudrv.service.latency import LatencyReport
+from imudrv.service.status_socket import FORMAT, VERSION
 from imudrv.sinks.base import SinkState
 from imudrv.wire.layout import Layout
-
-FORMAT: Final = "imu50-status"
-
-VERSION: Final = 1
-
-EXIT_CODES: Final = {"ok": 0, "warn": 3, "fail": 4}
-"""Exit code of `imudrv status` by health."""
 
 
 @dataclass(frozen=True)

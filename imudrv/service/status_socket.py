@@ -13,7 +13,12 @@ from pathlib import Path
 from typing import Any, Final
 
 from imudrv.errors import InputError
-from imudrv.service.status import FORMAT, VERSION
+
+FORMAT: Final = "imu50-status"
+VERSION: Final = 1
+EXIT_CODES: Final = {"ok": 0, "warn": 3, "fail": 4}
+"""Exit code of `imudrv status` by health."""
+
 
 MAX_STATUS: Final = 1 << 20
 """Largest status that a client accepts, bytes."""

@@ -131,9 +131,7 @@ def test_recordings_bring_their_own_profile_and_calibration(
     assert identify("z.raw", "x.raw", "y.raw", "-o", "captured.yaml") == 0
     assert recorded["size_effect"] == yaml.safe_load((here / "captured.yaml").read_text())["size_effect"]
     assert main([*recordings, "--unit", "50-0018"]) == 2
-    assert (
-        "z.mcap: expected the calibration of unit '50-0018', got that of '50-0017'" in capsys.readouterr().err
-    )
+    assert "z.mcap: expected a recording of unit '50-0018', got one of '50-0017'" in capsys.readouterr().err
     assert main(["identify", "z.mcap", "x.raw", "--site", "site.yaml", "-o", "never.yaml"]) == 2
     assert (
         "x.raw: expected a calibration, got a capture without one; give its file" in capsys.readouterr().err
