@@ -1,5 +1,6 @@
 """Phases of the procedure: blocks of 20 ms in, outcome and prompt out."""
 
+from abc import ABC, abstractmethod
 from dataclasses import replace
 from typing import Final
 
@@ -42,7 +43,7 @@ _HALF_BLOCK_S: Final = 0.5 * BLOCK_NS * NS
 _PRIORS: Final = Priors()
 
 
-class PhaseState:
+class PhaseState(ABC):
     """A phase while it lasts; made when the phase begins.
 
     Attributes
@@ -67,9 +68,9 @@ class PhaseState:
         """Take a block; None: the phase continues."""
         return None
 
+    @abstractmethod
     def prompt(self) -> Prompt:
         """Return what the operator has to do."""
-        raise NotImplementedError
 
 
 class Preflight(PhaseState):
