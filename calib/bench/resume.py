@@ -12,9 +12,8 @@ from calib.bench.session import Session
 from calib.bench.state import RESULT
 from calib.bench.verify import faulty_files
 from imudrv import profiles
-from imudrv.calibration import read_calibration
+from imudrv.calibration import read_calibration_file
 from imudrv.errors import InputError
-from imudrv.files import atomic
 
 RESUME_KELVIN: Final = 5.0
 """Largest difference of a temperature from its mean over the accepted runs when a session is resumed, K."""
@@ -50,13 +49,13 @@ def require_same(
     """
     plan, differ = session.plan, []
     active = calibration or plan.certificate.path
-    now = read_calibration(active)
-    if now.serial_number != plan.unit:
-        differ.append(f"unit: expected {plan.unit!r}, got {now.serial_number!r} ({active})")
-    elif (digest := atomic.sha256(active)) not in (plan.certificate.sha256, session.files.get(RESULT)):
+    now = read_calibration_file(active)
+    if now.model.serial_number != plan.unit:
+        differ.append(f"unit: expected {plan.unit!r}, got {now.model.serial_number!r} ({active})")
+    elif now.sha256 not in (plan.certificate.sha256, session.files.get(RESULT)):
         differ.append(
             f"certificate: expected the one that the session began with ({plan.certificate.sha256[:12]}), "
-            f"got another of the same unit ({active}, {digest[:12]})"
+            f"got another of the same unit ({active}, {now.sha256[:12]})"
         )
     given = [
         ("procedure", procedure, plan.procedure),

@@ -35,7 +35,7 @@ from calib.bench.state import (
 from calib.procedure.events import Redone
 from calib.procedure.schema import VERIFICATION
 from imudrv import profiles
-from imudrv.calibration import Calibration, read_calibration, write_calibration
+from imudrv.calibration import Calibration, read_calibration, read_calibration_file, write_calibration
 from imudrv.errors import InputError
 
 
@@ -96,15 +96,14 @@ class Session(SessionState):
         InputError
             The folder contains a session, or the folder or the certificate cannot be used.
         """
-        before = read_calibration(calibration)
-        content = calibration.read_bytes()
+        before = read_calibration_file(calibration)
         plan = Plan(
             format="imu50-session",
             version=1,
             software=f"imu50 {version('imu50')}",
-            unit=before.serial_number,
+            unit=before.model.serial_number,
             port=port,
-            certificate=CertificateFile(calibration.resolve(), hashlib.sha256(content).hexdigest()),
+            certificate=CertificateFile(calibration.resolve(), before.sha256),
             procedure=procedure,
             site=site,
             profile=EmbeddedFile.of(profile, profiles.content(profile)),
@@ -119,8 +118,8 @@ class Session(SessionState):
                 raise InputError(
                     f"{folder}: expected a new folder, it contains a session; resume it, or name another"
                 )
-            (folder / INITIAL_CERTIFICATE).write_bytes(content)
-            write_calibration(folder / WORKING_CERTIFICATE, before.model_copy(update={"size_effect": None}))
+            (folder / INITIAL_CERTIFICATE).write_bytes(before.content)
+            write_calibration(folder / WORKING_CERTIFICATE, before.model.without_size_effect())
             journal.begin(folder / JOURNAL, plan)
             return cls(folder, lock)
         except BaseException:

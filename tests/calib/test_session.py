@@ -23,13 +23,14 @@ from calib.bench.entries import (
 )
 from calib.bench.resume import check_files, require_same, require_temperature, resume
 from calib.bench.session import Session
-from calib.bench.state import JOURNAL
+from calib.bench.state import INITIAL_CERTIFICATE, JOURNAL
 from calib.bench.verify import verify
 from calib.procedure.events import Entered, Finished, Phase, Redone
 from calib.procedure.messages import Message, english
-from imudrv.calibration import write_calibration
+from imudrv.calibration import Calibration, read_calibration_file, write_calibration
 from imudrv.errors import InputError
 from imudrv.files import atomic, settings_file
+from imudrv.files.settings_file import SettingsFile
 from imudrv.sim.scenario import NOMINAL
 from imudrv.site import Site
 
@@ -561,3 +562,23 @@ def test_a_number_that_is_not_json_is_refused_before_it_is_written(session: Sess
     with pytest.raises(ValueError, match="not JSON compliant"):
         session.append(UnitDetected(1, False, {"gyro": float(np.nan)}))
     assert (session.folder / JOURNAL).read_bytes() == before
+
+
+def test_a_session_keeps_the_certificate_that_it_has_read_though_the_file_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Serial number, SHA-256 and copy come from one read, so that two certificates are never mixed."""
+    read: list[bytes] = []
+
+    def read_and_replace(path: Path) -> SettingsFile[Calibration]:
+        file = read_calibration_file(path)
+        read.append(file.content)
+        path.write_bytes(file.content + b"# another\n")
+        return file
+
+    monkeypatch.setattr("calib.bench.session.read_calibration_file", read_and_replace)
+    session = begin(tmp_path / "session")
+    session.close()
+    (content,) = read
+    assert (session.folder / INITIAL_CERTIFICATE).read_bytes() == content
+    assert session.plan.certificate.sha256 == sha256(content).hexdigest()
