@@ -10,6 +10,7 @@ import os
 import select
 import socket
 from collections.abc import Callable
+from fractions import Fraction
 from functools import partial
 from types import TracebackType
 from typing import Final, Self
@@ -26,7 +27,7 @@ from imudrv.ports.url import Url, split
 from imudrv.records import FRAME, Records
 from imudrv.sinks.serial import BAUDRATE
 from imudrv.wire.datagram import DatagramDecoder
-from imudrv.wire.layout import Layout
+from imudrv.wire.layout import Layout, Sequence, SequenceKind
 
 _EXPECTED: Final = "udp://[HOST]:PORT, tcp://HOST:PORT or serial:///dev/ttyUSB0?baudrate=921600"
 _LOOPBACK: Final = "127.0.0.1"
@@ -37,11 +38,8 @@ _COUNTED: Final = Layout(
     name="I50N",
     can=False,
     fd=False,
-    big_endian=False,
-    interval_ns=1,
-    totals=False,
-    counter_bits=32,
-    pulse_bits=32,
+    interval=Fraction(1),
+    sequence=Sequence(SequenceKind.COUNTER, 32),
     messages=(),
 )
 

@@ -15,8 +15,6 @@ Records: TypeAlias = NDArray[np.void]
 
 MAX_TEMPERATURES: Final = 6
 """Largest number of temperature channels of a profile."""
-NO_TEMPERATURE: Final = -(2**31)
-"""Temperature counts of a channel from which nothing has been received."""
 
 MESSAGE: Final = np.dtype(
     [
@@ -32,39 +30,55 @@ MESSAGE: Final = np.dtype(
 
 FRAME: Final = np.dtype(
     [
-        ("counter", np.int64),  # as on the wire, modulo 2^bits
+        ("counter", np.int64),  # as on the wire: modulo 2^bits, or a time in ticks
         ("offset", np.int64),  # of the first byte in the stream (CAN: index of the completing message)
-        ("t_ns", np.int64),  # arrival of the bytes that completed the frame, host clock
-        ("gyro", np.int32, 3),  # pulses, or running totals modulo 2^bits
-        ("accelerometer", np.int32, 3),
-        ("temperature", np.int32, MAX_TEMPERATURES),  # counts; the profile knows the unit
+        ("t_ns", np.int64),  # arrival of the bytes that completed the frame, host clock; 0: not known
+        ("gyro", np.int64, 3),  # counts, or the bits of a float64; totals modulo 2^bits
+        ("accelerometer", np.int64, 3),
+        ("temperature", np.float64, MAX_TEMPERATURES),  # counts; NaN: nothing was received
         ("status", np.uint32),
         ("damaged", np.int32),  # frames' worth of rejected bytes since the frame before
-        ("torn", np.int32),  # CAN samples given up half-complete since the frame before
+        ("torn", np.int32),  # samples given up since the frame before of which some messages came
     ],
     align=True,
 )
 """One valid frame as received."""
 
-PULSES: Final = np.dtype(
-    [
-        ("counter", np.int64),  # unwrapped
-        ("arrival_ns", np.int64),  # host clock
-        ("elapsed_ns", np.int64),  # end of the interval by the counter, since the start of the first sample
-        ("interval_ns", np.int64),  # covered by the pulses
-        ("gyro", np.int64, 3),
-        ("accelerometer", np.int64, 3),
-        ("temperature_degc", np.float64, MAX_TEMPERATURES),  # NaN: unknown
-        ("status", np.uint32),
-        ("flags", np.uint32),
-    ],
-    align=True,
-)
+
+def samples_type(*, gyro_pulses: bool, accelerometer_pulses: bool) -> np.dtype[np.void]:
+    """Type of samples whose losses are accounted for: pulses, or increments in rad and m/s.
+
+    Parameters
+    ----------
+    gyro_pulses, accelerometer_pulses : bool
+        Whether the unit sends whole pulses; otherwise increments in SI units, NaN for an axis that it lacks.
+
+    Returns
+    -------
+    dtype
+    """
+    return np.dtype(
+        [
+            ("counter", np.int64),  # of the unit, unwrapped; otherwise the number of the sample, from 0
+            ("arrival_ns", np.int64),  # host clock
+            ("elapsed_ns", np.int64),  # end of the interval by the counter, since the start of the first one
+            ("interval_ns", np.int64),  # covered by the increments
+            ("gyro", np.int64 if gyro_pulses else np.float64, 3),
+            ("accelerometer", np.int64 if accelerometer_pulses else np.float64, 3),
+            ("temperature_degc", np.float64, MAX_TEMPERATURES),  # NaN: unknown
+            ("status", np.uint32),
+            ("flags", np.uint32),
+        ],
+        align=True,
+    )
+
+
+PULSES: Final = samples_type(gyro_pulses=True, accelerometer_pulses=True)
 """One sample of pulse increments, its losses accounted for."""
 
 INCREMENTS: Final = np.dtype(
     [
-        ("counter", np.int64),
+        ("counter", np.int64),  # counts by one a sample
         ("t_ns", np.int64),  # end of the interval
         ("interval_ns", np.int64),
         ("dtheta_b", np.float64, 3),  # rad
@@ -103,6 +117,9 @@ class Flag(IntFlag):
     SIZE_EFFECT = 1 << 6
     CLOCK_UNLOCKED = 1 << 7
     WARM_UP = 1 << 8
+    GAP_BY_HOST_TIME = 1 << 9
+    GAP_LENGTH_UNKNOWN = 1 << 10
+    CLOCK_STEPPED = 1 << 11
 
 
 class Source(IntEnum):

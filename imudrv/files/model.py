@@ -14,6 +14,11 @@ class Model(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
+    @classmethod
+    def current(cls, document: object) -> object:
+        """Return a document of an earlier version of the format in the words of this one."""
+        return document
+
 
 def _utc(time: datetime) -> datetime:
     if not 2000 <= time.year < 3000:

@@ -1,6 +1,6 @@
 """Bytes of one message to the numbers of one FRAME record, driven by the profile's field table.
 
-Every kernel may read three bytes past the end of the message: buffers keep `SLACK` spare bytes.
+Every kernel may read seven bytes past the end of the message: buffers keep `SLACK` spare bytes.
 """
 
 from typing import Final
@@ -9,29 +9,48 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imudrv.kernels import kernel
-from imudrv.records import Records
+from imudrv.records import MAX_TEMPERATURES, Records
 from imudrv.wire.check import compute
-from imudrv.wire.layout import ACCELEROMETER, COUNTER, GYRO, STATUS, TEMPERATURE, CheckKind
+from imudrv.wire.layout import ACCELEROMETER, GYRO, SEQUENCE, STATUS, TEMPERATURE
 
 Bytes = NDArray[np.uint8]
 
-SLACK: Final = 4
-"""Spare bytes after the last message of a buffer: a number is read as four bytes whatever its width."""
+SLACK: Final = 8
+"""Spare bytes after the last message of a buffer: a number is read as four or eight bytes."""
 
 
 @kernel
-def read(data: Bytes, p: int, bits: int, signed: bool, big_endian: bool) -> int:
-    """Read the number of `bits` (8, 16, 24, 32) at `p`, as int64."""
+def word(data: Bytes, p: int, size: int, big_endian: bool) -> int:
+    """Read the word of `size` bytes (1 to 8) at `p`, as int64; those of 8 bytes keep their bits."""
     four = data[np.uint64(p) : np.uint64(p + 4)]
     b0, b1, b2, b3 = np.int64(four[0]), np.int64(four[1]), np.int64(four[2]), np.int64(four[3])
-    if big_endian:
-        word = (b0 << 24 | b1 << 16 | b2 << 8 | b3) >> (32 - bits)
-    else:
-        word = b0 | b1 << 8 | b2 << 16 | b3 << 24
-    spare = 64 - bits
-    if signed:
-        return int((word << spare) >> spare)
-    return int(word & ((np.int64(1) << bits) - 1))
+    little = b0 | b1 << 8 | b2 << 16 | b3 << 24
+    big = b0 << 24 | b1 << 16 | b2 << 8 | b3
+    if size <= 4:
+        return int(big >> (32 - 8 * size) if big_endian else little & ((np.int64(1) << 8 * size) - 1))
+    for k in range(4, size):
+        byte = np.int64(data[np.uint64(p + k)])
+        little |= byte << 8 * k
+        big = big << 8 | byte
+    return int(big if big_endian else little)
+
+
+@kernel
+def number(data: Bytes, p: int, field: np.void) -> int:
+    """Read a field of the message at `p`, as it is on the wire; a floating-point number as its bits."""
+    value = word(data, p + field["offset"], field["size"], field["big_endian"])
+    spare = 64 - field["bits"]
+    if field["signed"]:
+        return int(value << (spare - field["shift"]) >> spare)
+    return int(value >> field["shift"] & ~(np.int64(-1) << (64 - spare)) if spare else value)
+
+
+@kernel
+def real(bits: int, size: int) -> float:
+    """Return the floating-point number of 4 or 8 bytes with these bits."""
+    if size == 4:
+        return float(np.uint32(bits).view(np.float32))
+    return float(np.int64(bits).view(np.float64))
 
 
 @kernel
@@ -41,30 +60,65 @@ def ahead_of(counter: int | np.int64, other: int | np.int64, bits: int) -> int:
 
 
 @kernel
-def check_holds(data: Bytes, p: int, kind: np.void) -> bool:
-    """Whether the message at `p` carries the check value of its bytes."""
-    check = kind["check"]
-    carried = read(data, p + check["offset"], check["width"], False, kind["big_endian"])
-    # Computed even where there is none: a branch around it would count references to the arrays.
-    return bool((carried == compute(data, p, check)) | (check["kind"] == CheckKind.NONE))
+def checks_hold(data: Bytes, p: int, kind: np.void, checks: Records) -> bool:
+    """Whether the message at `p` carries the check values of its bytes."""
+    for c in range(np.uint64(kind["first_check"]), np.uint64(kind["end_check"])):
+        check = checks[c]
+        if word(data, p + check["offset"], check["size"], check["big_endian"]) != compute(data, p, check):
+            return False
+    return True
 
 
 @kernel
-def fill(data: Bytes, p: int, kind: np.void, fields: Records, frame: np.void) -> None:
+def fill(data: Bytes, p: int, kind: np.void, fields: Records, multiplexed: Records, frame: np.void) -> None:
     """Read every field of the message at `p` into `frame`; other members keep their values."""
-    big_endian = kind["big_endian"]
     # Unsigned indices spare numba's test for negative ones.
     for f in range(np.uint64(kind["first_field"]), np.uint64(kind["end_field"])):
-        field = fields[f]
-        target = field["target"]
-        value = read(data, p + field["offset"], field["bits"], field["signed"], big_endian)
-        if target == COUNTER:
-            frame["counter"] = value
-        elif target < ACCELEROMETER:
-            frame["gyro"][np.uint64(target - GYRO)] = np.int32(value)
-        elif target < STATUS:
-            frame["accelerometer"][np.uint64(target - ACCELEROMETER)] = np.int32(value)
-        elif target == STATUS:
-            frame["status"] = np.uint32(value)
+        _fill_field(data, p, fields[f], frame)
+    for f in range(np.uint64(kind["first_multiplexed"]), np.uint64(kind["end_multiplexed"])):
+        some = multiplexed[f]
+        selected = number(data, p, some["selector"])
+        if (selected % some["modulo"] if some["modulo"] else selected) == some["value"]:
+            _fill_field(data, p, some["field"], frame)
+
+
+@kernel
+def hold(frame: np.void, latest: np.void) -> None:
+    """Keep status and temperatures for the next frame, which may come without them."""
+    latest["status"] = frame["status"]
+    for channel in range(MAX_TEMPERATURES):
+        latest["temperature"][channel] = frame["temperature"][channel]
+
+
+@kernel
+def _fill_field(data: Bytes, p: int, field: np.void, frame: np.void) -> None:
+    target = field["target"]
+    value = number(data, p, field)
+    if field["is_float"]:
+        x = real(value, field["size"])
+        if target == SEQUENCE:
+            value = _ticks(x * field["ticks"])
+        elif target >= TEMPERATURE:
+            frame["temperature"][np.uint64(target - TEMPERATURE)] = x
+            return
         else:
-            frame["temperature"][np.uint64(target - TEMPERATURE)] = np.int32(value)
+            value = np.float64(field["sign"] * (x - field["zero"])).view(np.int64)
+    else:
+        value = field["sign"] * (value - field["zero"])
+    if target == SEQUENCE:
+        frame["counter"] = value
+    elif target < ACCELEROMETER:
+        frame["gyro"][np.uint64(target - GYRO)] = value
+    elif target < STATUS:
+        frame["accelerometer"][np.uint64(target - ACCELEROMETER)] = value
+    elif target == STATUS:
+        mask = ~(np.int64(-1) << field["bits"]) << field["place"]
+        frame["status"] = np.uint32(np.int64(frame["status"]) & ~mask | value << field["place"])
+    else:
+        frame["temperature"][np.uint64(target - TEMPERATURE)] = value
+
+
+@kernel
+def _ticks(x: float) -> int:
+    """Round a time to whole ticks; a message may hold any number, infinity and NaN among them."""
+    return int(np.int64(np.rint(x))) if abs(x) < 2.0**62 else 0
