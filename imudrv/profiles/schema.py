@@ -6,7 +6,7 @@ from pydantic import Field as Key
 from pydantic import field_validator, model_validator
 
 from imudrv.files.model import Model
-from imudrv.records import MAX_TEMPERATURES
+from imudrv.records import EXTENDED, MAX_TEMPERATURES
 from imudrv.units import NS_PER_S
 from imudrv.wire import layout
 
@@ -312,8 +312,10 @@ def _message(message: Message, temperatures: list[str]) -> layout.Message:
         else:
             target = layout.COUNTER if n.name == "counter" else layout.STATUS
         fields.append(layout.Field(target, n.offset, n.bits, n.type[0] == "i"))
+    can_id = message.id or 0
+    can_id |= EXTENDED if can_id > 0x7FF else 0
     return layout.Message(
-        message.length, tuple(fields), tuple(constants), _check(message.check), message.id or 0, message.every
+        message.length, tuple(fields), tuple(constants), _check(message.check), can_id, message.every
     )
 
 

@@ -90,7 +90,7 @@ class Message(NamedTuple):
     check : Check
         Protection of the message.
     can_id : int
-        CAN identifier; 0 in a stream.
+        CAN identifier, with `imudrv.records.EXTENDED` if it has 29 bits; 0 in a stream.
     every : int
         The message comes with every n-th sample; a sample is complete when all messages with 1 have come.
     """
