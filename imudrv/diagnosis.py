@@ -13,7 +13,7 @@ import numpy as np
 
 from imudrv.imu.sequence import SampleCounts, SequenceTracker
 from imudrv.profiles.schema import Profile, SerialLine
-from imudrv.records import Reason, Records
+from imudrv.records import EXTENDED, Reason, Records
 from imudrv.units import NS, NS_PER_S
 from imudrv.wire.decoder import FrameDecoder
 
@@ -45,7 +45,7 @@ class TrafficSummary:
     rejected : dict of Reason to int
         Number of rejected runs by reason.
     messages : dict of int to int
-        On CAN the number of messages for each identifier of the profile.
+        On CAN the number of messages for each identifier of the profile, with `EXTENDED` if it has 29 bits.
     set_bits : tuple of str
         Names of the status bits that were set at any time.
     degc : dict of str to float
@@ -104,7 +104,7 @@ def decode_traffic(profile: Profile, data: bytes | Records) -> TrafficSummary:
         syncs = data.count(bytes.fromhex(profile.messages[0].sync or ""))
         messages = {}
     else:
-        messages = {m.id or 0: int(np.count_nonzero(data["id"] == m.id)) for m in profile.messages}
+        messages = {m.can_id: int(np.count_nonzero(data["id"] == m.can_id)) for m in layout.messages}
         syncs = sum(messages.values())
     return TrafficSummary(
         len(data),
@@ -326,8 +326,12 @@ def explain(profile: Profile, traffic: TrafficSummary, seconds: float) -> str:
     for reason, count in sorted(traffic.rejected.items()):
         words.append(f"{count} x {reason.name.lower().replace('_', ' ')}")
     if traffic.messages:
-        words.append("by id: " + ", ".join(f"{number:03X} {n}" for number, n in traffic.messages.items()))
+        words.append("by id: " + ", ".join(f"{_id_text(id)} {n}" for id, n in traffic.messages.items()))
     return "; ".join(words)
+
+
+def _id_text(identifier: int) -> str:
+    return f"{identifier & ~EXTENDED:08X}" if identifier & EXTENDED else f"{identifier:03X}"
 
 
 def rate(traffic: TrafficSummary, seconds: float) -> float:

@@ -6,6 +6,7 @@ A name without a frame in it is on the sensors' own axes; ``dtheta_b`` and ``dv_
 """
 
 from enum import IntEnum, IntFlag
+from struct import Struct
 from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -16,10 +17,13 @@ Records: TypeAlias = NDArray[np.void]
 MAX_TEMPERATURES: Final = 6
 """Largest number of temperature channels of a profile."""
 
+EXTENDED: Final = 1 << 31
+"""Bit of an identifier of 29 bits, as in SocketCAN: 150 of 11 bits and 00000150 are two identifiers."""
+
 MESSAGE: Final = np.dtype(
     [
         ("t_ns", np.int64),  # arrival, host clock; from a log: its own time
-        ("id", np.uint32),
+        ("id", np.uint32),  # with `EXTENDED` if it has 29 bits
         ("length", np.uint8),  # of the data, bytes
         ("fd", np.uint8),  # 1: CAN FD
         ("data", np.uint8, 64),  # zeros after the length
@@ -27,6 +31,9 @@ MESSAGE: Final = np.dtype(
     align=True,
 )
 """One CAN message."""
+
+MESSAGE_ROW: Final = Struct("=qIBB64s2x")
+"""A row of `MESSAGE`, its data padded with zeros: packing one is faster than filling an array."""
 
 FRAME: Final = np.dtype(
     [
@@ -103,6 +110,7 @@ class Reason(IntEnum):
     TORN = 5
     STALE = 6
     NOT_A_MESSAGE = 7
+    ERROR_FRAME = 8
 
 
 class Flag(IntFlag):

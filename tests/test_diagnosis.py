@@ -4,13 +4,16 @@ import random
 from collections.abc import Iterable, Iterator
 from itertools import pairwise
 
+import numpy as np
 import pytest
 
-from imudrv.diagnosis import LineState, LineWatch
+from imudrv.diagnosis import LineState, LineWatch, decode_traffic, explain
 from imudrv.profiles import load
+from imudrv.records import EXTENDED, MESSAGE
 from imudrv.units import NS_PER_S
 
 RS422 = load("imu50-rs422")
+CAN = load("imu50-can")
 STREAMING = LineState("streaming")
 LENGTH = RS422.messages[0].length
 TURN_NS = NS_PER_S // 100
@@ -94,6 +97,15 @@ def test_bytes_without_a_sample_do_not_end_a_silence() -> None:
         watch.arrived(50, 0, t_ns)
         names += [watch.state(t_ns).name, watch.state(t_ns + NS_PER_S // 2).name]
     assert set(names[1:]) == {"silent"}
+
+
+def test_messages_are_counted_by_identifiers_as_the_bus_writes_them() -> None:
+    messages = (CAN.messages[0].model_copy(update={"id": 0x18FF0150}), *CAN.messages[1:])
+    profile = CAN.model_copy(update={"messages": messages})
+    data = np.zeros(3, MESSAGE)
+    data["id"] = EXTENDED | 0x18FF0150, EXTENDED | 0x151, 0x151
+    text = explain(profile, decode_traffic(profile, data), 1.0)
+    assert "by id: 18FF0150 1, 151 1, 152 0, 153 0" in text
 
 
 @pytest.mark.parametrize("rate_hz", [1.0, 2.0, 10.0, 200.0, 1000.0])

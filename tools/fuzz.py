@@ -42,7 +42,7 @@ from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import NAMES, rate_filter
 from imudrv.imu.sequence import SequenceTracker
 from imudrv.profiles.schema import Profile
-from imudrv.records import INCREMENTS, MESSAGE, PULSES, Records, Source
+from imudrv.records import EXTENDED, INCREMENTS, MESSAGE, PULSES, Records, Source
 from imudrv.service.settings import Settings
 from imudrv.sim import scenario
 from imudrv.site import Site
@@ -305,7 +305,9 @@ def check_candump(_: Setup, data: bytes, cuts: Cuts) -> None:
     assert lines == sum(channels[0].values()) + len(rejects), f"{lines} lines, messages {channels[0]}"
     assert len(messages) == next(iter(channels[0].values()), 0), f"{len(messages)} messages of {channels[0]}"
     assert np.all(messages["length"] <= np.where(messages["fd"], 64, 8)), "more data than a bus carries"
-    assert np.all(messages["id"] < 2**29), "no bus has such an identifier"
+    identifiers = messages["id"]
+    limits = np.where(identifiers & EXTENDED, 2**29, 2**11)
+    assert np.all(identifiers & ~np.uint32(EXTENDED) < limits), "no bus has such an identifier"
     again, _ = decode([format_candump(messages)])
     again["t_ns"] += messages["t_ns"] % 1000  # a log has microseconds
     assert np.array_equal(again, messages)

@@ -14,7 +14,7 @@ from imudrv.errors import InputError
 from imudrv.ports.base import PortLostError
 from imudrv.ports.can import prepare
 from imudrv.ports.url import split
-from imudrv.records import PULSES, Records
+from imudrv.records import EXTENDED, PULSES, Records
 from imudrv.sinks.base import Batch, Sink, SinkState
 from imudrv.wire.encode import CanEncoder
 from imudrv.wire.layout import Layout
@@ -150,8 +150,8 @@ class CanSink(Sink):
             identifier, length = int(message["id"]), int(message["length"])
             bus.send(
                 can.Message(
-                    arbitration_id=identifier,
-                    is_extended_id=identifier > 0x7FF,
+                    arbitration_id=identifier & ~EXTENDED,
+                    is_extended_id=bool(identifier & EXTENDED),
                     is_fd=self._layout.fd,
                     bitrate_switch=self._layout.fd,
                     data=message["data"][:length].tobytes(),

@@ -15,7 +15,7 @@ from imudrv.errors import InputError
 from imudrv.hostclock import now_ns
 from imudrv.ports import PortLostError, open_port
 from imudrv.ports.can import CanPort
-from imudrv.records import MESSAGE
+from imudrv.records import EXTENDED, MESSAGE
 
 GROUP = "239.74.163.2"
 
@@ -75,12 +75,25 @@ def test_only_data_of_the_units_own_identifiers_come(can_profile, opened, arriva
     assert [int(id) for arrival in arrivals(port, 2) for id in arrival.data["id"]] == [0x150, 0x153]
 
 
-def test_an_identifier_of_29_bits_is_received(can_profile, opened, arrivals):
+def test_an_identifier_of_29_bits_is_received_and_differs_from_one_of_11_bits(can_profile, opened, arrivals):
     messages = (can_profile.messages[0].model_copy(update={"id": 0x1ABCDEF0}), *can_profile.messages[1:])
     port = opened("can://virtual/extended", can_profile.model_copy(update={"messages": messages}))
     with _bus("extended") as unit:
+        unit.send(can.Message(arbitration_id=0x151, is_extended_id=True))
         unit.send(_message(0x1ABCDEF0))
-    assert arrivals(port, 1)[0].data["id"].tolist() == [0x1ABCDEF0]
+        unit.send(_message(0x151))
+    received = np.concatenate([arrival.data for arrival in arrivals(port, 2)])
+    assert received["id"].tolist() == [EXTENDED | 0x1ABCDEF0, 0x151]
+
+
+def test_a_bus_that_filters_nothing_gives_both_kinds_of_identifier(arrivals):
+    with _bus("unfiltered") as unit:
+        port = CanPort("can://virtual/unfiltered", _bus("unfiltered"))
+        unit.send(can.Message(arbitration_id=0x150, is_extended_id=True))
+        unit.send(_message(0x150))
+        received = np.concatenate([arrival.data for arrival in arrivals(port, 2)])
+        port.close()
+    assert received["id"].tolist() == [EXTENDED | 0x150, 0x150]
 
 
 class Broken(can.BusABC):

@@ -325,6 +325,16 @@ def test_a_can_bus_carries_the_messages_of_the_capture(
     assert (played.sent, played.undelivered, played.unit) == (len(wanted), 0, "messages")
 
 
+def test_identifiers_of_29_bits_are_sent_as_such(run: Scenario, player: Player) -> None:
+    messages = (CAN.messages[0].model_copy(update={"id": 0x18FF0150}), *CAN.messages[1:])
+    profile = CAN.model_copy(update={"messages": messages})
+    with can.Bus("wide", "virtual", ignore_config=True) as listener:
+        player.start(run, profile, "can://virtual/wide", 2.0)
+        received = [listener.recv(GENEROUS_S) for _ in range(4)]
+    sent = [(m.arbitration_id, m.is_extended_id) for m in received if m is not None]
+    assert sent == [(0x18FF0150, True), (0x151, False), (0x152, False), (0x153, False)]
+
+
 @pytest.mark.parametrize(
     ("target", "profile", "message"),
     [

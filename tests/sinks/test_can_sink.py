@@ -45,6 +45,19 @@ def test_pulses_of_a_serial_unit_go_out_on_a_can_bus(batch, wait_for, profile: s
         sink.close()
 
 
+def test_identifiers_of_29_bits_are_sent_as_such(batch, wait_for, tmp_path: Path) -> None:
+    profile = tmp_path / "wide.yaml"
+    profile.write_bytes(profiles.content("imu50-can").replace(b"id: 0x150", b"id: 0x18FF0150"))
+    with can.Bus("wide gateway", "virtual") as bus:
+        sink = CanSink(f"can://virtual/wide gateway?profile={profile}", SERIAL)
+        wait_for(lambda: sink.state.state == "ok")
+        sink.publish(batch(0, 1))
+        received = [bus.recv(20) for _ in range(2)]
+        sink.close()
+    sent = [(m.arbitration_id, m.is_extended_id) for m in received if m is not None]
+    assert sent == [(0x18FF0150, True), (0x151, False)]
+
+
 def protocol(fd: bool) -> can.CanProtocol:
     return can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
 

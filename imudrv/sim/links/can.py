@@ -8,7 +8,7 @@ import can
 
 from imudrv.errors import InputError
 from imudrv.profiles.schema import CanLine
-from imudrv.records import Records
+from imudrv.records import EXTENDED, Records
 from imudrv.sim.links.base import POLL_S, RETRY_S, TIMEOUT_S, LineOptions, SimulatedLine
 
 
@@ -55,8 +55,8 @@ class SimulatedCanBus(SimulatedLine):
         heads = zip(data["id"].tolist(), data["length"].tolist(), data["fd"].tolist(), strict=True)
         for i, (identifier, length, fd) in enumerate(heads):
             message = can.Message(
-                arbitration_id=identifier,
-                is_extended_id=identifier > 0x7FF,
+                arbitration_id=identifier & ~EXTENDED,
+                is_extended_id=bool(identifier & EXTENDED),
                 is_fd=bool(fd),
                 bitrate_switch=bool(fd),
                 data=content[i * width : i * width + length],
