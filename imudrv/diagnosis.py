@@ -181,7 +181,7 @@ class LineWatch:
     def __init__(self, profile: Profile, in_real_time: bool, t_ns: int) -> None:
         self._profile = profile
         self._in_real_time = in_real_time
-        interval_ns = round(NS_PER_S / profile.sample_rate_hz)
+        interval_ns = profile.layout().interval_ns
         held = 2 * max(message.every for message in profile.messages)  # on CAN, for their full counter
         self._silence_ns = SILENCE_NS + 2 * interval_ns
         self._unreadable_ns = UNREADABLE_NS + held * interval_ns
@@ -232,7 +232,7 @@ class LineWatch:
         self._counted = expected, t_ns
         if len(self._rates) < _RATE_SECONDS:
             return
-        nominal = self._profile.sample_rate_hz
+        nominal = self._profile.rate_hz
         slack = RATE_TOLERANCE * nominal + 1.0 / _RATE_SECONDS  # the ends may fall between two samples
         least, most = nominal - slack, nominal + slack
         if least <= min(self._rates) and max(self._rates) <= most:
@@ -292,7 +292,7 @@ def line_load(profile: Profile) -> float:
     float
         More than 1: the line is too slow.
     """
-    line, rate = profile.line, profile.sample_rate_hz
+    line, rate = profile.line, profile.rate_hz
     if isinstance(line, SerialLine):
         return profile.transmission_ns * NS * rate
     if line.data_bitrate is not None:

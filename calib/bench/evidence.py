@@ -289,7 +289,7 @@ def _decode(attempt: Attempt) -> _DecodedRecording:
     begin = int(backward[-1]) + 1 if len(backward) else 0
     counter = counter[begin:]
     if len(counter) and not begin:  # at a restart the service, too, begins with the unit's own number
-        counter = counter + _offset(recording, attempt, int(counter[0]), 1 << layout.counter_bits)
+        counter = counter + _offset(recording, attempt, int(counter[0]), 1 << layout.sequence.bits)
     first, stop = np.searchsorted(counter, [attempt.first_counter, attempt.last_counter + 1])
     return _DecodedRecording(
         samples[begin + first : begin + stop], counter[first:stop], layout, tracker.counts

@@ -17,7 +17,7 @@ def check_line_load(profile: Profile) -> Finding:
     load = diagnosis.line_load(profile)
     line = profile.line
     speed = f"{line.baudrate} baud" if isinstance(line, SerialLine) else f"{line.bitrate} bit/s"
-    found = f"{profile.name} at {profile.sample_rate_hz:g} Hz takes {100 * load:.1f} % of {speed}"
+    found = f"{profile.name} at {profile.rate_hz:g} Hz takes {100 * load:.1f} % of {speed}"
     if load > 1.0:
         return Finding("line load", Verdict.FAIL, found, "set the unit and the port to a higher line rate")
     if load > _HEAVY_LOAD:
@@ -56,8 +56,8 @@ def check_traffic(
         found = f"it jumped back {counts.restarts} times"
         yield Finding("counter", Verdict.WARN, found, "check the unit's power supply")
     rate_hz = diagnosis.rate(traffic, span_s)
-    if in_real_time and abs(rate_hz / profile.sample_rate_hz - 1.0) > diagnosis.RATE_TOLERANCE:
-        found = f"expected {profile.sample_rate_hz:g} samples/s, the unit counts {rate_hz:.0f}"
+    if in_real_time and abs(rate_hz / profile.rate_hz - 1.0) > diagnosis.RATE_TOLERANCE:
+        found = f"expected {profile.rate_hz:g} samples/s, the unit counts {rate_hz:.0f}"
         fix = "set sample_rate_hz in the profile, or the rate in the unit"
         yield Finding("rate", Verdict.FAIL, found, fix)
     bits = ", ".join(traffic.set_bits) or "no bit set"

@@ -26,7 +26,7 @@ SENSOR: Final = np.dtype(
     [
         ("values", np.int64),  # Values
         ("in_pulses", np.bool_),
-        ("is_float", np.bool_, 3),
+        ("is_float", np.int64, 3),  # 0 or 1: numba knows no fields of several bools
         ("bits", np.int64, 3),
         ("lowest", np.int64, 3),  # saturated counts of an increment or a rate
         ("highest", np.int64, 3),

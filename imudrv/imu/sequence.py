@@ -272,7 +272,7 @@ def _forward(frames: Records, i: int, c: np.void, s: np.void) -> int:
 def _one_forward(frame: np.void, counter: int, is_soon: bool, c: np.void) -> int:
     """By how many samples a frame is ahead of the one before it, within one round of the counter."""
     if c["sequence"] == SequenceKind.NONE:
-        return 1 + np.int64(frame["torn"])
+        return 1 + int(frame["torn"])
     ticks = (frame["counter"] - counter) & ((np.int64(1) << c["bits"]) - 1)
     if ticks == 0 and is_soon:
         return 0
@@ -281,7 +281,7 @@ def _one_forward(frame: np.void, counter: int, is_soon: bool, c: np.void) -> int
 
 @kernel
 def _has_hole(frame: np.void, c: np.void) -> bool:
-    """Whether bytes were rejected before a frame without a number or a time: who knows of how many samples."""
+    """Whether bytes were rejected before a frame without number and time: of how many samples is unknown."""
     return bool(c["sequence"] == SequenceKind.NONE and frame["t_ns"] == 0 and frame["damaged"] > 0)
 
 

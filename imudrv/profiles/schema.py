@@ -96,7 +96,7 @@ class Profile(Model):
             *self._status_and_temperature_faults(),
         ]
         if not 1 <= self.rate_hz <= 100_000:
-            found.append(f"sample_rate_hz: expected 1 to 100000, got {float(self.rate_hz):g}")
+            found.append(f"sample_rate_hz: expected 1 to 100000, got {self.rate_hz:g}")
         if found:
             raise ValueError("; ".join(found))
         return self
@@ -133,12 +133,12 @@ class Profile(Model):
     def _header_faults(self) -> Iterator[str]:
         """Yield the messages that cannot be told from one before."""
         for k, message in enumerate(self.messages):
-            for other in self.messages[:k]:
+            for j, other in enumerate(self.messages[:k]):
                 one, two = message.header, other.header
                 same_id = message.can_id[0] & other.can_id[1] == other.can_id[0] & message.can_id[1]
                 if same_id and all(one[at] == two[at] for at in one.keys() & two.keys()):
                     how = "id or constants" if self.transport == "can" else "sync or constants"
-                    yield f"messages[{k}]: expected another {how} than messages[{self.messages.index(other)}] has"
+                    yield f"messages[{k}]: expected another {how} than messages[{j}] has"
                     break
 
     def _sensor_faults(self) -> Iterator[str]:
@@ -196,10 +196,10 @@ class Profile(Model):
             if n.name == "time" and n.step is not None:
                 step_s = n.step / TICKS_PER_S[n.unit or "s"]
                 # Ticks are whole: a mean over many samples may differ by less than one.
-                if abs(step_s * float(self.rate_hz) - 1.0) > 0.01:
+                if abs(step_s * self.rate_hz - 1.0) > 0.01:
                     yield (
                         f"time.step: expected {float(TICKS_PER_S[n.unit or 's'] / self.rate_hz):g} {n.unit} "
-                        f"for {float(self.rate_hz):g} samples/s, got {n.step:g}; change one of them"
+                        f"for {self.rate_hz:g} samples/s, got {n.step:g}; change one of them"
                     )
             if n.name == "counter" and n.width < 64 and n.step is not None and n.step >= 1 << n.width:
                 yield f"counter.step: expected less than {1 << n.width}, for it has {n.width} bits, got {n.step:g}"
@@ -216,9 +216,14 @@ class Profile(Model):
         if len(set(sensors)) < len(sensors) or len(sensors) > MAX_TEMPERATURES:
             yield f"temperature: expected up to {MAX_TEMPERATURES}, each sensor once, got {sensors}"
 
-    @cached_property
-    def rate_hz(self) -> Fraction:
+    @property
+    def rate_hz(self) -> float:
         """Sample rate, Hz."""
+        return float(self.rate)
+
+    @cached_property
+    def rate(self) -> Fraction:
+        """Sample rate, Hz, exactly."""
         if isinstance(self.sample_rate_hz, tuple):
             return Fraction(*self.sample_rate_hz)
         return Fraction(self.sample_rate_hz).limit_denominator(1_000_000)
@@ -250,8 +255,8 @@ class Profile(Model):
             name=self.name,
             can=self.transport == "can",
             fd=self.fd,
-            interval=Fraction(NS_PER_S) / self.rate_hz,
-            sequence=made.sequence(self.rate_hz),
+            interval=Fraction(NS_PER_S) / self.rate,
+            sequence=made.sequence(self.rate),
             messages=tuple(made.message(m, is_can=self.transport == "can") for m in self.messages),
             gyro=made.sensor("gyro", self.gyro),
             accelerometer=made.sensor("accelerometer", self.accelerometer),

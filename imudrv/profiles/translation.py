@@ -49,7 +49,7 @@ class Translation:
         status = [n for n in numbers if n.name == "status"]
         self._places = {id(n): sum(other.width for other in status[:k]) for k, n in enumerate(status)}
 
-    def sequence(self, rate_hz: Fraction) -> layout.Sequence:
+    def sequence(self, rate: Fraction) -> layout.Sequence:
         """Return what numbers the samples."""
         numbers = [n for m in self._messages for n in m.fields if n.name in ("counter", "time")]
         if not numbers:
@@ -59,7 +59,7 @@ class Translation:
             bits = max(n.width for n in numbers)
             return layout.Sequence(layout.SequenceKind.COUNTER, bits, Fraction(int(n.step or 1)))
         unit = TICKS_PER_S[n.unit or "s"]
-        step = unit / rate_hz if n.step is None else Fraction(n.step).limit_denominator(_STEPS)
+        step = unit / rate if n.step is None else Fraction(n.step).limit_denominator(_STEPS)
         if n.is_float:
             step *= Fraction(TICKS_PER_S["ns"], unit)
         return layout.Sequence(layout.SequenceKind.TIME, 64 if n.is_float else n.width, step)
@@ -70,8 +70,8 @@ class Translation:
             return layout.Sensor(in_pulses=False)
         numbers = {n.axis: n for m in self._messages for n in m.fields if n.name == name}
         axes = [numbers.get(axis) for axis in _AXES]
-        x, y, z = (n and self._field(n) for n in axes)
-        scales = [(n and n.per_count) or entry.per_count or 1.0 for n in axes]
+        x, y, z = (None if n is None else self._field(n) for n in axes)
+        scales = [(n.per_count if n else None) or entry.per_count or 1.0 for n in axes]
         x_per_count, y_per_count, z_per_count = (_SI[entry.unit] * scale for scale in scales)
         return layout.Sensor(
             values=layout.Values[entry.values.upper()],
@@ -114,7 +114,7 @@ class Translation:
 
     def _target(self, n: Number) -> int:
         if n.name == "temperature":
-            return layout.TEMPERATURE + [t.sensor for t in self._temperatures].index(n.sensor)
+            return layout.TEMPERATURE + [t.sensor for t in self.temperatures].index(n.sensor)
         if n.axis:
             return (layout.GYRO if n.name == "gyro" else layout.ACCELEROMETER) + _AXES.index(n.axis)
         return layout.STATUS if n.name == "status" else layout.SEQUENCE

@@ -73,7 +73,7 @@ def export_imr(recording: Recording, pieces: Iterator[Records], target: Path) ->
     header["szHeader"] = b"$IMURAW"
     header["dVersionNumber"] = 8.80
     header["bDeltaTheta"] = header["bDeltaVelocity"] = 1
-    header["dDataRateHz"] = recording.profile.sample_rate_hz
+    header["dDataRateHz"] = recording.profile.rate_hz
     header["dGyroScaleFactor"] = _GYRO_DEG
     header["dAccelScaleFactor"] = _ACCELEROMETER_M_S
     header["iUtcOrGpsTime"] = 1

@@ -293,7 +293,7 @@ class Service:
             unit=calibration.current.model.serial_number,
             calibration=calibration.status,
             rate_hz=self._rate_hz,
-            nominal_rate_hz=self._profile.sample_rate_hz,
+            nominal_rate_hz=self._profile.rate_hz,
             samples=SampleStatus(**vars(pipeline.tracker.counts), lost_last_s=self._lost_last_s),
             rejected={
                 reason.name.lower(): RejectedStatus(entry.runs, entry.length)

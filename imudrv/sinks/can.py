@@ -58,7 +58,7 @@ class CanSink(Sink):
         if self._layout.interval_ns != layout.interval_ns:
             raise InputError(
                 f"{url}: expected a profile of {1e9 / layout.interval_ns:g} samples/s like the unit, "
-                f"got {profile.name} with {profile.sample_rate_hz:g}; choose another profile"
+                f"got {profile.name} with {profile.rate_hz:g}; choose another profile"
             )
         self._temperatures = _related(layout.temperature_names, self._layout.temperature_names)
         CanEncoder(self._layout).encode(np.zeros(1, PULSES))  # compile before samples arrive

@@ -142,17 +142,17 @@ def _absorb(
     # the other, none in a branch, spare the counting of references to the arrays.
     p, stop = np.uint64(start), np.uint64(end)
     one, two, step = np.uint64(1), np.uint64(2), np.uint64(8)
-    a, b = np.int64(first), np.int64(second)
+    a, b = int(first), int(second)
     while kind == CheckKind.XOR and p < stop:
-        a ^= np.int64(data[p])
+        a ^= int(data[p])
         p += one
     while kind < CheckKind.CRC and check["word"] == 2 and p + one < stop:
-        low, high = np.int64(data[p]), np.int64(data[p + one])
+        low, high = int(data[p]), int(data[p + one])
         a += low << 8 | high if big_endian else high << 8 | low
         b += a
         p += two
     while kind < CheckKind.CRC and p < stop:
-        a += np.int64(data[p])
+        a += int(data[p])
         b += a
         p += one
     # How far the register is shifted right for its byte that meets byte 0, 1, 2, 3 of the message.
@@ -172,4 +172,4 @@ def _absorb(
         met = table[0, data[p] ^ (register >> s0 & 0xFF)]
         register = np.uint32((register << 8 if s0 else register >> 8) ^ met)
         p += one
-    return (np.int64(register), b) if kind >= CheckKind.CRC else (a, b)
+    return (int(register), b) if kind >= CheckKind.CRC else (a, b)

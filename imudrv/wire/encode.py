@@ -45,7 +45,7 @@ class _Encoder:
     def __init__(self, layout: Layout, totals: ArrayLike = (0, 0, 0, 0, 0, 0)) -> None:
         self._layout = layout
         self._kinds, _, _, self._constants, self._checks = layout_tables(layout)
-        self._fields = [np.array(message.fields, FIELD) for message in layout.messages]
+        self._fields = [np.array(list(message.fields), FIELD) for message in layout.messages]
         self._totals = np.array(totals, np.float64)
         self._sent = 0
 
@@ -72,22 +72,23 @@ class _Encoder:
             return np.zeros(samples.size)
         counts: Floats = values[:, column % 3] / sensor.per_count[column % 3]
         if sensor.values is Values.RATE:
-            T = np.maximum(samples["interval_ns"], 1) * NS
-            return counts / T if axis.is_float else np.rint(counts / T)
+            counts /= np.maximum(samples["interval_ns"], 1) * NS
+            return counts if axis.is_float else np.rint(counts)
         if axis.is_float and sensor.values is Values.INCREMENT:
             return counts
         if sensor.values is Values.TOTAL and not axis.is_float:
             # A total of n bits distinguishes as many increments as a signed number of n bits.
             self._require_room(samples, counts, _AXES[column], axis.bits, is_signed=True)
         before = self._totals[column]
-        totals = before + np.cumsum(counts)
+        totals: Floats = before + np.cumsum(counts)
         self._totals[column] = totals[-1]
         if axis.is_float:
             return totals
-        totals = np.rint(totals)
+        np.rint(totals, out=totals)
         if sensor.values is Values.TOTAL:
             return totals
-        return np.diff(totals, prepend=np.rint(before))
+        increments: Floats = np.diff(totals, prepend=np.rint(before))
+        return increments
 
     def _messages(self, k: int, samples: Records, counts: list[Floats], at: Ints) -> NDArray[np.uint8]:
         """Encode the messages of kind `k`, one a row."""

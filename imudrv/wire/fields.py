@@ -102,7 +102,7 @@ def _fill_field(data: Bytes, p: int, field: np.void, frame: np.void) -> None:
             frame["temperature"][np.uint64(target - TEMPERATURE)] = x
             return
         else:
-            value = np.float64(field["sign"] * (x - field["zero"])).view(np.int64)
+            value = int(np.float64(field["sign"] * (x - field["zero"])).view(np.int64))
     else:
         value = field["sign"] * (value - field["zero"])
     if target == SEQUENCE:

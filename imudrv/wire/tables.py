@@ -80,7 +80,7 @@ def layout_tables(layout: Layout) -> Tables:
     fields: list[Field] = []
     multiplexed: list[tuple[Field, Field, int, int]] = []
     constants: list[tuple[int, int]] = []
-    checks = []
+    checks: list[np.void] = []
     part = 0
     for kind, message in zip(kinds, layout.messages, strict=True):
         kind["first_field"], kind["first_multiplexed"] = len(fields), len(multiplexed)
