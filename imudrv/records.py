@@ -42,7 +42,7 @@ FRAME: Final = np.dtype(
         ("t_ns", np.int64),  # arrival of the bytes that completed the frame, host clock; 0: not known
         ("gyro", np.int64, 3),  # counts, or the bits of a float64; totals modulo 2^bits
         ("accelerometer", np.int64, 3),
-        ("temperature", np.float64, MAX_TEMPERATURES),  # counts; NaN: nothing was received
+        ("temperature", np.float32, MAX_TEMPERATURES),  # counts; NaN: nothing was received
         ("status", np.uint32),
         ("damaged", np.int32),  # frames' worth of rejected bytes since the frame before
         ("torn", np.int32),  # samples given up since the frame before of which some messages came

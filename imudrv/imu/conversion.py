@@ -158,18 +158,21 @@ def _convert(counts: Array, sensor: np.void, T: float, out: Numbers) -> bool:
     A floating-point number has no limit but must be finite.
     """
     inside = True
-    for axis in range(3):
-        count = counts[axis]
-        if sensor["in_pulses"]:
+    if sensor["in_pulses"]:
+        for axis in range(3):
+            count = counts[axis]
             out[axis] = count
+            inside &= sensor["lowest"][axis] < count < sensor["highest"][axis]
+        return inside
+    factor = T if sensor["values"] == Values.RATE else 1.0
+    for axis in range(3):
+        if sensor["is_float"][axis]:
+            number = np.int64(counts[axis]).view(np.float64)
+            inside &= np.isfinite(number)
         else:
-            number = np.int64(count).view(np.float64) if sensor["is_float"][axis] else float(count)
-            out[axis] = number * sensor["per_count"][axis] * (T if sensor["values"] == Values.RATE else 1.0)
-            if sensor["is_float"][axis]:
-                inside = inside and np.isfinite(number)
-                continue
-        if count <= sensor["lowest"][axis] or count >= sensor["highest"][axis]:
-            inside = False
+            number = float(counts[axis])
+            inside &= sensor["lowest"][axis] < counts[axis] < sensor["highest"][axis]
+        out[axis] = number * sensor["per_count"][axis] * factor
     return inside
 
 
@@ -218,17 +221,20 @@ def _subtract(total: Array, latest: Array, rate: Array, steps: int, sensor: np.v
     """Set the increments of one sensor, and their rate; return whether they are unambiguous."""
     sure = True
     for axis in range(3):
-        bits = sensor["bits"][axis]
         if sensor["is_float"][axis]:
             difference = np.int64(total[axis]).view(np.float64) - np.int64(latest[axis]).view(np.float64)
             out[axis] = difference * sensor["per_count"][axis]
+            sure &= np.isfinite(difference)
+            continue
+        bits = sensor["bits"][axis]
+        counts = ahead_of(total[axis], latest[axis], bits)
+        out[axis] = counts if sensor["in_pulses"] else counts * sensor["per_count"][axis]
+        if steps == 1:
+            rate[axis] = counts
             continue
         # Across a gap totals may wrap more than once, unless the rate before it was well within their width.
-        if steps > 1 and abs(rate[axis]) * steps >= np.int64(1) << (bits - 2):
-            sure = False
-        counts = ahead_of(np.int64(total[axis]), latest[axis], bits)
+        sure &= abs(rate[axis]) * steps < np.int64(1) << (bits - 2)
         rate[axis] = counts // steps
-        out[axis] = counts if sensor["in_pulses"] else counts * sensor["per_count"][axis]
     return sure
 
 

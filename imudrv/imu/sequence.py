@@ -56,7 +56,7 @@ class SampleCounts:
     unknown_gaps: int
     """Gaps with their smallest length: no time of arrival tells how often the counter went round."""
     other_step: int
-    """Frames whose number is as far from the one before as that was, yet not by the step of the profile."""
+    """Frames behind a gap as long as the gap before: many of them show a wrong step in the profile."""
 
     @property
     def closes(self) -> bool:
@@ -98,7 +98,7 @@ STATE: Final = np.dtype(
         ("fraction", np.int64),  # of a ns that is not in it, of `parts`
         ("arrival_ns", np.int64),  # of the newest frame
         ("arrivals", ARRIVALS),
-        ("advance", np.int64),  # of the newest frame, samples
+        ("advance", np.int64),  # of the newest frame behind a gap, samples
         ("lost_before", np.bool_),  # samples are missing before the next one that is output
         ("damaged", np.int64),  # frames' worth of bytes, and frames with an invalid counter, since `newest`
         ("torn", np.int64),  # samples given up before those frames
@@ -288,6 +288,8 @@ def _has_hole(frame: np.void, c: np.void) -> bool:
 @kernel
 def _interval(steps: int, c: np.void, s: np.void) -> int:
     """Time of that many samples, in whole ns whose sum never drifts."""
+    if c["remainder"] == 0:
+        return int(steps * c["interval_ns"])
     s["fraction"] += steps * c["remainder"]
     whole = s["fraction"] // c["parts"]
     s["fraction"] -= whole * c["parts"]
@@ -315,12 +317,12 @@ def _advance(frame: np.void, ahead: int, c: np.void, s: np.void, n: np.void) -> 
         return 1
     if ahead > 0:
         n["expected"] += ahead
-        n["other_step"] += ahead > 1 and ahead == s["advance"]
-        s["advance"] = ahead
         s["newest"] += ahead
         _count_ticks(frame, ahead, c, s)
         s["received"] = (s["received"] << ahead | 1) if ahead < WINDOW else 1
         if ahead > 1:
+            n["other_step"] += ahead == s["advance"]
+            s["advance"] = ahead
             _count_lost(ahead - 1, frame, s, n)
         return ahead
     _count_behind(ahead, s, n)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from imudrv.kernels import kernel
 from imudrv.records import INCREMENTS, Records, Source
-from imudrv.wire.check import compute
+from imudrv.wire.check import compute_plain
 from imudrv.wire.layout import SEQUENCE, Check, CheckKind, Field, Layout, Message, Sequence, SequenceKind
 from imudrv.wire.stream import StreamDecoder
 from imudrv.wire.tables import layout_tables
@@ -60,14 +60,14 @@ def encode(increments: Records, source: Source) -> bytes:
         76 per sample, back to back.
     """
     data = np.empty((len(increments), SIZE), np.uint8)
-    _fill(increments, data, data.view(DATAGRAM), int(source), _CHECKS)
+    _fill(increments, data, data.view(DATAGRAM), int(source), _KINDS)
     return data.tobytes()
 
 
 @kernel
-def _fill(increments: Records, data: NDArray[np.uint8], rows: Records, source: int, checks: Records) -> None:
+def _fill(increments: Records, data: NDArray[np.uint8], rows: Records, source: int, kinds: Records) -> None:
     """Write datagrams; `rows`, shape (n, 1), and `data` are the same memory."""
-    check = checks[0]
+    check = kinds[0]["plain_check"]
     for i in range(increments.shape[0]):
         sample, row, out = increments[i], rows[i, 0], data[i]
         for k in range(len(MAGIC)):
@@ -77,7 +77,7 @@ def _fill(increments: Records, data: NDArray[np.uint8], rows: Records, source: i
         row["interval_ns"], row["t_ns"] = sample["interval_ns"], sample["t_ns"]
         for k in range(3):
             row["dtheta_b"][k], row["dv_b"][k] = sample["dtheta_b"][k], sample["dv_b"][k]
-        row["crc"] = np.uint32(compute(out, 0, check))
+        row["crc"] = np.uint32(compute_plain(out, 0, check))
 
 
 class Received(NamedTuple):
@@ -126,7 +126,7 @@ _LAYOUT: Final = Layout(
 )
 
 
-_CHECKS: Final = layout_tables(_LAYOUT)[-1]
+_KINDS: Final = layout_tables(_LAYOUT)[0]
 
 
 class DatagramDecoder:

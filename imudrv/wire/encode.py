@@ -10,7 +10,7 @@ from imudrv.errors import InputError
 from imudrv.kernels import kernel
 from imudrv.records import MESSAGE, Records
 from imudrv.units import NS
-from imudrv.wire.check import compute
+from imudrv.wire.check import compute, compute_plain
 from imudrv.wire.layout import (
     GYRO,
     SEQUENCE,
@@ -293,10 +293,13 @@ def _write_fields(rows: NDArray[np.uint8], numbers: Ints, fields: Records) -> No
 @kernel
 def _finish_rows(rows: NDArray[np.uint8], kind: np.void, constants: Records, checks: Records) -> None:
     """Add the constants and then the check values to messages of one kind, one a row."""
+    plain = kind["plain_check"]
     for i in range(rows.shape[0]):
         row = rows[np.uint64(i)]
         for c in range(np.uint64(kind["first_constant"]), np.uint64(kind["end_constant"])):
             row[np.uint64(constants[c]["offset"])] = constants[c]["value"]
+        if plain["kind"]:
+            _write(row, plain["offset"], plain["size"], plain["big_endian"], compute_plain(row, 0, plain))
         for c in range(np.uint64(kind["first_check"]), np.uint64(kind["end_check"])):
             check = checks[c]
             _write(row, check["offset"], check["size"], check["big_endian"], compute(row, 0, check))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from imudrv.kernels import kernel
 from imudrv.records import MAX_TEMPERATURES, Records
-from imudrv.wire.check import compute
+from imudrv.wire.check import compute, compute_plain
 from imudrv.wire.layout import ACCELEROMETER, GYRO, SEQUENCE, STATUS, TEMPERATURE
 
 Bytes = NDArray[np.uint8]
@@ -20,19 +20,30 @@ SLACK: Final = 8
 
 
 @kernel
-def word(data: Bytes, p: int, size: int, big_endian: bool) -> int:
-    """Read the word of `size` bytes (1 to 8) at `p`, as int64; those of 8 bytes keep their bits."""
+def short_number(data: Bytes, p: int, bits: int, signed: bool, big_endian: bool) -> int:
+    """Read the number of `bits` (8, 16, 24, 32) at `p`, as int64."""
     four = data[np.uint64(p) : np.uint64(p + 4)]
     b0, b1, b2, b3 = np.int64(four[0]), np.int64(four[1]), np.int64(four[2]), np.int64(four[3])
-    little = b0 | b1 << 8 | b2 << 16 | b3 << 24
-    big = b0 << 24 | b1 << 16 | b2 << 8 | b3
+    if big_endian:
+        word = (b0 << 24 | b1 << 16 | b2 << 8 | b3) >> (32 - bits)
+    else:
+        word = b0 | b1 << 8 | b2 << 16 | b3 << 24
+    spare = 64 - bits
+    if signed:
+        return int((word << spare) >> spare)
+    return int(word & ((np.int64(1) << bits) - 1))
+
+
+@kernel
+def word(data: Bytes, p: int, size: int, big_endian: bool) -> int:
+    """Read the word of `size` bytes (1 to 8) at `p`, as int64; those of 8 bytes keep their bits."""
     if size <= 4:
-        return int(big >> (32 - 8 * size) if big_endian else little & ((np.int64(1) << 8 * size) - 1))
-    for k in range(4, size):
-        byte = np.int64(data[np.uint64(p + k)])
-        little |= byte << 8 * k
-        big = big << 8 | byte
-    return int(big if big_endian else little)
+        return short_number(data, p, 8 * size, False, big_endian)
+    value = 0
+    for k in range(size):
+        byte = np.int64(data[np.uint64(p + (k if big_endian else size - 1 - k))])
+        value = value << 8 | byte
+    return int(value)
 
 
 @kernel
@@ -60,8 +71,19 @@ def ahead_of(counter: int | np.int64, other: int | np.int64, bits: int) -> int:
 
 
 @kernel
+def plain_check_holds(data: Bytes, p: int, kind: np.void) -> bool:
+    """Whether the message at `p` carries the value of its plain check, if it has one."""
+    check = kind["plain_check"]
+    carried = short_number(data, p + check["offset"], check["width"], False, check["big_endian"])
+    # Computed even where there is none: a branch around it would count references to the arrays.
+    return bool((carried == compute_plain(data, p, check)) | (check["kind"] == 0))
+
+
+@kernel
 def checks_hold(data: Bytes, p: int, kind: np.void, checks: Records) -> bool:
-    """Whether the message at `p` carries the check values of its bytes."""
+    """Whether the message at `p` carries the values of all its checks."""
+    if not plain_check_holds(data, p, kind):
+        return False
     for c in range(np.uint64(kind["first_check"]), np.uint64(kind["end_check"])):
         check = checks[c]
         if word(data, p + check["offset"], check["size"], check["big_endian"]) != compute(data, p, check):
@@ -73,7 +95,11 @@ def checks_hold(data: Bytes, p: int, kind: np.void, checks: Records) -> bool:
 def fill(data: Bytes, p: int, kind: np.void, fields: Records, multiplexed: Records, frame: np.void) -> None:
     """Read every field of the message at `p` into `frame`; other members keep their values."""
     # Unsigned indices spare numba's test for negative ones.
-    for f in range(np.uint64(kind["first_field"]), np.uint64(kind["end_field"])):
+    for f in range(np.uint64(kind["first_field"]), np.uint64(kind["end_plain"])):
+        field = fields[f]
+        at, is_big = p + field["offset"], field["big_endian"]
+        _put(short_number(data, at, field["bits"], field["signed"], is_big), field["target"], frame)
+    for f in range(np.uint64(kind["end_plain"]), np.uint64(kind["end_field"])):
         _fill_field(data, p, fields[f], frame)
     for f in range(np.uint64(kind["first_multiplexed"]), np.uint64(kind["end_multiplexed"])):
         some = multiplexed[f]
@@ -105,6 +131,15 @@ def _fill_field(data: Bytes, p: int, field: np.void, frame: np.void) -> None:
             value = int(np.float64(field["sign"] * (x - field["zero"])).view(np.int64))
     else:
         value = field["sign"] * (value - field["zero"])
+    if target == STATUS:
+        mask = ~(np.int64(-1) << field["bits"]) << field["place"]
+        value = int(frame["status"] & ~mask | value << field["place"])
+    _put(value, target, frame)
+
+
+@kernel
+def _put(value: int, target: int, frame: np.void) -> None:
+    """Set a number of a frame."""
     if target == SEQUENCE:
         frame["counter"] = value
     elif target < ACCELEROMETER:
@@ -112,8 +147,7 @@ def _fill_field(data: Bytes, p: int, field: np.void, frame: np.void) -> None:
     elif target < STATUS:
         frame["accelerometer"][np.uint64(target - ACCELEROMETER)] = value
     elif target == STATUS:
-        mask = ~(np.int64(-1) << field["bits"]) << field["place"]
-        frame["status"] = np.uint32(np.int64(frame["status"]) & ~mask | value << field["place"])
+        frame["status"] = np.uint32(value)
     else:
         frame["temperature"][np.uint64(target - TEMPERATURE)] = value
 

@@ -90,6 +90,12 @@ class Field(NamedTuple):
     place: int = 0
     ticks: float = 1.0
 
+    @property
+    def is_plain(self) -> bool:
+        """Whether it is the usual one: a whole number of whole bytes, up to four."""
+        others = self._replace(target=0, offset=0, size=0, bits=0, signed=False, big_endian=False, ticks=1.0)
+        return others == Field(0, 0, 0) and self.size <= 4 and self.bits == 8 * self.size
+
 
 class Multiplexed(NamedTuple):
     """A field that is there only while another number of the message has one value.
@@ -159,6 +165,17 @@ class Check(NamedTuple):
         """Bytes of the check value."""
         return (self.width + 7) // 8
 
+    @property
+    def is_plain(self) -> bool:
+        """Whether it is the usual one: a CRC or a sum of bytes, of one range that is all on the wire."""
+        is_sum = self.kind is CheckKind.SUM and self.word == 1 and not (self.modulo or self.negated)
+        return (
+            len(self.ranges) == 1
+            and not self.suffix
+            and self.width % 8 == 0
+            and (is_sum or self.kind >= CheckKind.CRC)
+        )
+
 
 class Message(NamedTuple):
     """One kind of message.
@@ -189,6 +206,11 @@ class Message(NamedTuple):
     can_id: int = 0
     can_mask: int = 0xFFFFFFFF
     every: int = 1
+
+    @property
+    def plain_check(self) -> Check | None:
+        """The first check, if it is plain; the decoder has a faster way for it."""
+        return self.checks[0] if self.checks and self.checks[0].is_plain else None
 
     @property
     def is_part(self) -> bool:

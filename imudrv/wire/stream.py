@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from imudrv.kernels import kernel
 from imudrv.records import FRAME, REJECT, Reason, Records
-from imudrv.wire.fields import SLACK, checks_hold, fill, hold
+from imudrv.wire.fields import SLACK, checks_hold, fill, hold, plain_check_holds
 from imudrv.wire.layout import MAX_MESSAGES, Layout
 from imudrv.wire.tables import Tables, layout_tables
 
@@ -74,7 +74,10 @@ class StreamDecoder:
         self._tables = layout_tables(layout)
         self._length = sum(message.length for message in layout.messages if message.is_part)
         only = layout.messages[0]
-        self._walk = _scan if len(layout.messages) == 1 and not only.multiplexed else _scan_kinds
+        is_usual = (
+            len(layout.messages) == 1 and not only.multiplexed and only.checks in ((), (only.plain_check,))
+        )
+        self._walk = _scan if is_usual else _scan_kinds
         self._buffer: NDArray[np.uint8] = np.zeros(self._length + SLACK, np.uint8)
         self._pending = 0
         self._state = np.zeros(1, STATE)
@@ -189,12 +192,12 @@ def _scan(
         whether the data have ended. Bytes before that position then leave the buffer.
     """
     # Out of the tuple once: each access inside the loop would count references.
-    kinds, fields, multiplexed, constants, checks = tables
+    kinds, fields, multiplexed, constants, _ = tables
     kind, s = kinds[0], state[0]
-    length, offset, end = kind["length"], s["offset"], kind["end_constant"]
+    length, offset = kind["length"], s["offset"]
     found = rejected = 0
     while rejected < rejects.shape[0]:
-        header = _compare(data, p, stop, constants, 0, end)
+        header = _compare(data, p, stop, constants)
         if header == _DIFFERS:
             _skip(s, offset + p, _NO_SYNC)
             p += 1
@@ -202,7 +205,7 @@ def _scan(
         if header == _IS_CUT or p + length > stop:
             s["offset"] += p
             return p, found, rejected, True
-        is_good = checks_hold(data, p, kind, checks)
+        is_good = plain_check_holds(data, p, kind)
         if s["reject_offset"] >= 0:
             _close_reject(rejects[rejected], s, offset + p)
             rejected += 1
@@ -231,7 +234,7 @@ def _scan_kinds(
     frames: Records,
     rejects: Records,
 ) -> tuple[int, int, int, bool]:
-    """Do what `_scan` does, where there are several kinds of message or multiplexed numbers."""
+    """Do what `_scan` does, for several kinds of message, multiplexed numbers or any checks; slower."""
     kinds, fields, multiplexed, constants, checks = tables
     s = state[0]
     offset = s["offset"]
@@ -305,7 +308,7 @@ def _kind_at(data: NDArray[np.uint8], p: int, stop: int, kinds: Records, constan
     """Return the kind of message that is whole at `p`, or that none is, or that the data end too early."""
     for k in range(kinds.shape[0]):
         kind = kinds[k]
-        header = _compare(data, p, stop, constants, kind["first_constant"], kind["end_constant"])
+        header = _compare(data, p, stop, constants[kind["first_constant"] : kind["end_constant"]])
         if header == _MATCHES and p + kind["length"] <= stop:
             return k
         if header != _DIFFERS:
@@ -330,9 +333,9 @@ def _reject(reject: np.void, offset: int, length: int, reason: int) -> None:
 
 
 @kernel
-def _compare(data: NDArray[np.uint8], p: int, stop: int, constants: Records, first: int, end: int) -> int:
+def _compare(data: NDArray[np.uint8], p: int, stop: int, constants: Records) -> int:
     """Compare the bytes at `p` with the constant bytes of a message, as far as they have come."""
-    for c in range(np.uint64(first), np.uint64(end)):
+    for c in range(constants.shape[0]):
         at = p + constants[c]["offset"]
         if at >= stop:
             return _IS_CUT

@@ -41,6 +41,7 @@ KIND: Final = np.dtype(
         ("can_mask", np.int64),
         ("length", np.int64),  # bytes
         ("first_field", np.int64),  # rows of the table of fields, `end_field` excluded,
+        ("end_plain", np.int64),  # plain ones first,
         ("end_field", np.int64),
         ("first_multiplexed", np.int64),  # of multiplexed ones,
         ("end_multiplexed", np.int64),
@@ -51,6 +52,7 @@ KIND: Final = np.dtype(
         ("part", np.int64),  # which one of those that every sample has; -1: of none
         ("is_skipped", np.bool_),  # there is nothing in it
         ("sequence", FIELD),  # bits 0: without one
+        ("plain_check", CHECK),  # kind 0: without one
     ],
     align=True,
 )
@@ -85,10 +87,16 @@ def layout_tables(layout: Layout) -> Tables:
     for kind, message in zip(kinds, layout.messages, strict=True):
         kind["first_field"], kind["first_multiplexed"] = len(fields), len(multiplexed)
         kind["first_constant"], kind["first_check"] = len(constants), len(checks)
-        fields += message.fields
+        plain = [field for field in message.fields if field.is_plain]
+        fields += plain
+        kind["end_plain"] = len(fields)
+        fields += [field for field in message.fields if not field.is_plain]
         multiplexed += message.multiplexed
         constants += message.constants
-        checks += [check_table(check) for check in message.checks]
+        rest = message.checks
+        if message.plain_check is not None:
+            kind["plain_check"], rest = check_table(message.plain_check), rest[1:]
+        checks += [check_table(check) for check in rest]
         kind["end_field"], kind["end_multiplexed"] = len(fields), len(multiplexed)
         kind["end_constant"], kind["end_check"] = len(constants), len(checks)
         kind["part"] = part if message.is_part else -1
