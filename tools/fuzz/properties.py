@@ -11,7 +11,7 @@ from imudrv.wire.layout import Layout
 from imudrv.wire.stream import StreamDecoder
 
 Setup: TypeAlias = Any
-"""What a case needs beside its bytes, as a literal that can be pasted into a test."""
+"""What a case needs in addition to its bytes, as a literal that can be pasted into a test."""
 Cuts: TypeAlias = Sequence[int]
 """Where the input is cut into pieces, in bytes."""
 Decode: TypeAlias = Callable[[list[Any]], Sequence[Records]]
