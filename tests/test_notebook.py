@@ -66,7 +66,7 @@ def test_importing_the_package_loads_no_large_library_and_the_calibration_no_ker
     subprocess.run([sys.executable, "-c", code], check=True, timeout=300)
 
 
-def test_every_public_name_is_there_and_no_other_is_listed() -> None:
+def test_every_public_name_exists_and_no_other_is_listed() -> None:
     code = (
         "import imudrv, imudrv.cli; from imudrv import *; "
         "assert dir(imudrv) == sorted(imudrv.__all__); "
