@@ -10,7 +10,13 @@ from imudrv.units import DEG
 
 
 class Site(Model):
-    """A location on the Earth; `gravity_m_s2` is absent if it was not measured."""
+    """A location on the Earth; `gravity_m_s2` is absent if it was not measured.
+
+    Examples
+    --------
+    >>> round(Site(latitude_deg=28.2, longitude_deg=113.0, height_m=60.0).gravity, 5)
+    9.79168
+    """
 
     format: Literal["imu50-site"] = "imu50-site"
     version: Literal[1] = 1

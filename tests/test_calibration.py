@@ -151,7 +151,7 @@ def test_temperature_terms_are_in_si_per_kelvin() -> None:
     assert terms.accelerometer_scale_per_k == pytest.approx([4e-6, 5e-6, 6e-6], rel=1e-15)
 
 
-def test_nobody_changes_a_certificate_through_its_arrays() -> None:
+def test_a_certificate_cannot_be_changed_through_its_arrays() -> None:
     got = calibration()
     assert got.size_effect is not None
     for array in (
@@ -319,7 +319,7 @@ NEAR_IDENTITY = st.lists(st.floats(-0.02, 0.02), min_size=9, max_size=9).map(
 @given(
     VECTOR, POSITIVE, NEAR_IDENTITY, NEAR_IDENTITY, st.lists(VECTOR, min_size=3, max_size=3), st.booleans()
 )
-def test_a_certificate_comes_back_bit_for_bit(
+def test_a_certificate_is_read_back_bit_for_bit(
     bias: list[float],
     scale: list[float],
     C_bg: list[list[float]],
@@ -416,7 +416,7 @@ def test_a_written_site_says_that_it_is_one(tmp_path: Path) -> None:
         ("latitude", 28, "latitude: unknown key; did you mean latitude_deg?"),
     ],
 )
-def test_a_site_that_cannot_be_is_refused(key: str, value: object, words: str) -> None:
+def test_an_impossible_site_is_refused(key: str, value: object, words: str) -> None:
     with pytest.raises(FaultyFileError) as caught:
         parse({**SITE, key: value}, Site, "site.yaml")
     (only,) = caught.value.faults

@@ -95,7 +95,7 @@ def driven(
 
 
 @pytest.mark.parametrize("profile", profiles.shipped())
-def test_truth_comes_back_within_the_quantisation(profile: str) -> None:
+def test_increments_equal_the_truth_within_the_quantisation(profile: str) -> None:
     arcsec, pulse_per_m_s = 0.5, 2000.0
     calibration = unit(arcsec, pulse_per_m_s)
     increments, truth = driven(profile, scenario(calibration, ROCKING), calibration)
@@ -116,7 +116,7 @@ def test_truth_comes_back_within_the_quantisation(profile: str) -> None:
 
 
 @pytest.mark.parametrize("filter_name", ["causal", "centred", "dither"])
-def test_the_size_effect_of_rocking_is_taken_off_to_a_tenth_of_a_micrometre_a_second(
+def test_the_size_effect_of_rocking_is_removed_to_a_tenth_of_a_micrometre_per_second(
     filter_name: str,
 ) -> None:
     calibration = unit(2e-5, 2e8)  # so fine that pulses hide nothing

@@ -64,7 +64,7 @@ def here(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize("log", ["two.log", "late.log"])
-def test_a_log_of_two_units_is_refused_by_every_command_however_late_the_second_comes(
+def test_a_log_of_two_units_is_refused_by_every_command_however_late_the_second_appears(
     command: str,
     log: str,
     here: Path,
@@ -79,7 +79,7 @@ def test_a_log_of_two_units_is_refused_by_every_command_however_late_the_second_
 
 
 @pytest.mark.parametrize("channel", ["can0", "can1"])
-def test_the_chosen_unit_comes_out_as_from_a_log_of_its_own(
+def test_the_chosen_unit_is_decoded_as_from_a_separate_log(
     channel: str, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert imudrv(["decode", f"{channel}.log", *PROFILE, "-o", "out.npz"]) == 0
@@ -154,7 +154,7 @@ def test_a_replay_of_two_units_is_refused_before_a_sample_is_served(here: Path) 
     assert (here / "out.csv").read_text() == ""
 
 
-def test_a_replay_serves_one_unit_until_the_second_one_comes(here: Path) -> None:
+def test_a_replay_serves_one_unit_until_the_second_one_appears(here: Path) -> None:
     done = serve("replay://late.log?speed=max")
     assert done.returncode == 2
     assert f"{BOTH.replace('two.log', 'late.log')}?channel=can0" in done.stderr

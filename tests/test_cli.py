@@ -68,7 +68,7 @@ size_effect:
 """
 
 
-def test_decode_accounts_for_every_sample_and_writes_what_the_manual_says(bench: Path) -> None:
+def test_decode_counts_every_sample_and_writes_the_documented_columns(bench: Path) -> None:
     done = imudrv("decode", "run.raw", "--profile", "imu50-rs422", "-o", "run.npz", cwd=bench)
     assert done.returncode == 0, done.stderr
     assert "2000 samples by the counter" in done.stdout
@@ -168,7 +168,9 @@ def test_a_candump_log_works_for_the_can_profiles(bench: Path) -> None:
         (["check", "run.raw"], "run.raw"),
     ],
 )
-def test_a_users_mistake_is_one_message_and_exit_code_2(arguments: list[str], said: str, bench: Path) -> None:
+def test_a_mistake_of_the_user_gives_one_message_and_exit_code_2(
+    arguments: list[str], said: str, bench: Path
+) -> None:
     done = imudrv(*arguments, cwd=bench)
     assert done.returncode == 2
     assert said in done.stderr
@@ -228,7 +230,7 @@ def test_ctrl_c_leaves_no_half_file(bench: Path) -> None:
     assert not list(bench.glob("*long.raw*"))
 
 
-def test_real_laser_gyro_pulses_come_through_the_wire_as_they_are(data: Path, tmp_path: Path) -> None:
+def test_real_laser_gyro_pulses_are_unchanged_by_encoding_and_decoding(data: Path, tmp_path: Path) -> None:
     source = data / "lasergyro.imu"
     tool = [sys.executable, str(ROOT / "tools" / "psins_to_wire.py"), str(source), "-o", "real.raw"]
     subprocess.run(tool, cwd=tmp_path, check=True, timeout=300)

@@ -347,7 +347,7 @@ def test_a_silent_bus_is_reported() -> None:
     assert "termination" in data.fix
 
 
-def test_a_profile_reads_a_stretch_that_begins_and_ends_anywhere() -> None:
+def test_a_profile_decodes_a_section_with_any_start_and_end() -> None:
     data = sent(RS422, 0.5)
     summary = diagnosis.decode_traffic(RS422, data[17:-3])
     assert summary.fits

@@ -167,7 +167,7 @@ def test_ros2_names_the_package_that_it_needs(recorded: Recording, tmp_path: Pat
         export(recorded, "ros2", tmp_path / "out.mcap")
 
 
-def test_a_kind_that_there_is_not_is_refused(recorded: Recording, tmp_path: Path) -> None:
+def test_an_unknown_kind_is_refused(recorded: Recording, tmp_path: Path) -> None:
     with pytest.raises(
         InputError, match="--to: expected one of csv, npz, raw, candump, imr, ros2, got 'mat'"
     ):

@@ -116,7 +116,7 @@ def make(kind: str, path: Path) -> None:
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize("kind", ["device", "pipe", "socket", "folder"])
 @pytest.mark.parametrize("link", [False, True])
-def test_what_is_no_file_is_refused_and_stays_what_it_is(
+def test_an_output_that_is_no_file_is_refused_and_not_changed(
     command: str, kind: str, link: bool, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     suffix = SUFFIX.get(command, "")
@@ -192,7 +192,7 @@ def test_an_output_in_a_missing_folder_is_refused_with_the_name_of_the_folder(he
         pass
 
 
-def test_a_link_that_leads_in_a_circle_is_refused(here: Path) -> None:
+def test_a_circular_link_is_refused(here: Path) -> None:
     os.symlink("it", "it")
     with pytest.raises(InputError, match="it: cannot be written: Too many levels"), atomic_write(here / "it"):
         pass
@@ -237,7 +237,7 @@ def test_standard_output_has_a_second_name(here: Path) -> None:
 @pytest.mark.parametrize(
     "command", ["pack", "imr", "identify", "json", "report", "validate", "gauge", "import-arms"]
 )
-def test_what_makes_no_sense_on_standard_output_is_refused_in_a_line(
+def test_options_invalid_on_standard_output_are_refused_in_a_line(
     command: str, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     files = set(os.listdir())
@@ -248,7 +248,7 @@ def test_what_makes_no_sense_on_standard_output_is_refused_in_a_line(
     assert set(os.listdir()) == files
 
 
-def test_a_full_standard_output_is_reported_and_one_that_its_reader_leaves_is_no_fault(here: Path) -> None:
+def test_a_full_standard_output_is_reported_and_a_closed_pipe_is_no_fault(here: Path) -> None:
     command = process("decode run.csv --profile own.csv -o -")
     with open("/dev/full", "wb") as full:
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, timeout=120, check=False)
@@ -272,7 +272,7 @@ def test_an_output_that_is_redirected_onto_its_input_is_refused(here: Path, made
     assert (here / "run.csv").read_bytes() == made["run.csv"]
 
 
-def test_a_live_file_is_made_neither_of_a_pipe_nor_of_standard_output(here: Path) -> None:
+def test_a_live_file_cannot_be_a_pipe_or_standard_output(here: Path) -> None:
     os.mkfifo("pipe")
     for name, what in (("pipe", "got a pipe"), ("-", "cannot go to standard output")):
         with pytest.raises(InputError, match=f"{name}: expected a file.*{what}"):

@@ -149,7 +149,7 @@ def test_an_invented_profile_works_by_path_without_code(document: dict[str, obje
     assert tracker.counts.closes
 
 
-def test_a_profile_tells_all_its_faults_at_once(tmp_path: Path) -> None:
+def test_all_faults_of_a_profile_are_reported_at_once(tmp_path: Path) -> None:
     document = stream_profile(byte_order="middle", sample_rate_hz=0, colour="red")
     with pytest.raises(FaultyFileError) as caught:
         profiles.load(written(tmp_path, document))
@@ -178,7 +178,7 @@ def test_a_profile_tells_all_its_faults_at_once(tmp_path: Path) -> None:
         ({"status_bits": [{"bit": 1, "name": "a", "means": "fault"}] * 2}, "each bit once"),
     ],
 )
-def test_a_profile_that_makes_no_sense_is_refused_with_the_reason(
+def test_an_invalid_profile_is_refused_with_the_reason(
     change: dict[str, object], said: str, tmp_path: Path
 ) -> None:
     with pytest.raises(FaultyFileError, match=said):

@@ -49,7 +49,7 @@ def contents(recording: Recording) -> tuple[list[object], ...]:
     )
 
 
-def test_everything_that_was_recorded_comes_back(recorded: Path) -> None:
+def test_everything_recorded_is_read_again(recorded: Path) -> None:
     recording = Recording(recorded)
     assert not recording.cut
     assert recording.profile == profiles.load("imu50-rs422")

@@ -232,7 +232,7 @@ def serial(folder: Path) -> list[object]:
     return ["--port", folder / "unit", "--profile", "imu50-rs422", "--calibration", "unit.yaml"]
 
 
-def test_every_sample_comes_out_in_order_and_as_the_offline_command_makes_it(folder: Path) -> None:
+def test_every_sample_is_sent_in_order_and_equals_that_of_the_offline_command(folder: Path) -> None:
     unit = Unit(folder / "unit")
     out = f"udp://127.0.0.1:{free_port()}"
     with (
@@ -300,7 +300,7 @@ def test_silence_is_reported_and_nothing_exits(folder: Path) -> None:
     assert not service.socket.exists()
 
 
-def test_bytes_without_a_frame_are_a_failure_until_frames_come_again(folder: Path) -> None:
+def test_bytes_without_a_frame_are_a_failure_until_frames_resume(folder: Path) -> None:
     unit = Unit(folder / "unit")
     garbage = bytes(range(1, 200))  # no sync in it
     with serving(folder, *serial(folder)) as service:
@@ -447,7 +447,7 @@ def test_at_the_start_constants_and_sha256_agree_too(
             assert status.unit == units[status.calibration.sha256]
 
 
-def test_a_reader_of_its_text_that_leaves_costs_the_text_alone(folder: Path) -> None:
+def test_a_closed_pipe_loses_only_the_printed_text(folder: Path) -> None:
     unit = Unit(folder / "unit")
     reader, stdout = os.pipe()
     with serving(folder, *serial(folder), stdout=stdout) as service:
@@ -467,7 +467,7 @@ def test_a_reader_of_its_text_that_leaves_costs_the_text_alone(folder: Path) -> 
         assert service.stop() == 0
 
 
-def test_a_full_disk_under_its_text_costs_the_text_alone(folder: Path) -> None:
+def test_a_full_disk_loses_only_the_redirected_text(folder: Path) -> None:
     unit = Unit(folder / "unit")
     with open("/dev/full", "w") as full, serving(folder, *serial(folder), stdout=full.fileno()) as service:
         until(service.serves, "the status")
@@ -477,7 +477,7 @@ def test_a_full_disk_under_its_text_costs_the_text_alone(folder: Path) -> None:
         assert service.stop() == 0
 
 
-def test_a_stopped_terminal_holds_its_text_alone(folder: Path) -> None:
+def test_a_stopped_terminal_delays_only_the_text(folder: Path) -> None:
     unit = Unit(folder / "unit")
     master, slave = pty.openpty()
     os.set_blocking(master, False)
@@ -529,7 +529,7 @@ def test_a_sighup_while_it_starts_does_not_end_it(folder: Path) -> None:
         assert service.stop() == 0
 
 
-def test_it_ends_with_another_exit_code_when_its_terminal_has_gone(folder: Path) -> None:
+def test_the_exit_code_differs_when_the_terminal_was_closed(folder: Path) -> None:
     unit = Unit(folder / "unit")
     master, slave = pty.openpty()
     with serving(folder, *serial(folder), stdin=slave) as service:
@@ -572,7 +572,7 @@ def test_a_tcp_client_that_stops_reading_loses_its_own_samples_only(folder: Path
         assert service.stop() == 0
 
 
-def test_a_receiver_that_is_not_there_costs_nothing(folder: Path) -> None:
+def test_an_absent_receiver_has_no_effect(folder: Path) -> None:
     unit = Unit(folder / "unit")
     with serving(folder, *serial(folder), "--out", f"udp://127.0.0.1:{free_port()}") as service:
         unit.send(500)

@@ -92,9 +92,7 @@ def replayed(recording: Recording) -> Records:
 
 
 @pytest.mark.parametrize("keeps", [True, False])
-def test_a_recording_begins_at_a_sample_that_is_past_where_there_is_a_history(
-    tmp_path: Path, keeps: bool
-) -> None:
+def test_a_recording_starts_at_a_past_sample_of_the_history(tmp_path: Path, keeps: bool) -> None:
     write_calibration(tmp_path / "unit.yaml", NOMINAL)
     settings = Settings(
         port="sim://rocking?speed=20",
@@ -131,7 +129,7 @@ def test_a_recording_begins_at_a_sample_that_is_past_where_there_is_a_history(
         assert np.array_equal(again[name][whole], published[name][whole])
 
 
-def test_after_a_replacement_of_the_calibration_a_recording_begins_with_the_new_one(tmp_path: Path) -> None:
+def test_a_recording_after_a_replacement_of_the_calibration_starts_with_the_new_one(tmp_path: Path) -> None:
     write_calibration(tmp_path / "unit.yaml", NOMINAL)
     settings = Settings(
         port="sim://static?speed=20",

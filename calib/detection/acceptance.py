@@ -122,6 +122,11 @@ def expected_error_mm(peak_deg_per_s: float) -> float:
 
     A minimum-jerk half turn takes `T = 180 * 1.875 / peak`; the velocity changes by 8.8 / T m/s per metre of
     lever arm, and by `T hypot(b, g m)` m/s from b = 50 ug of bias and m = 30 urad of gyro misalignment.
+
+    Examples
+    --------
+    >>> [round(expected_error_mm(peak), 2) for peak in (70.0, 140.0)]  # half the time: a quarter
+    [1.51, 0.38]
     """
     if peak_deg_per_s <= 0.0:
         return inf

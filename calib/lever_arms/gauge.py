@@ -99,6 +99,12 @@ def convert(
     ------
     InputError
         Unknown gauge; `given` without a known point, or a known point with another gauge; invalid point.
+
+    Examples
+    --------
+    >>> arms = LeverArms(np.array([[24, -11, -9], [-23, 29, -7], [-1, -18, 16]]) * MM, None, "centroid")
+    >>> (convert(arms, "x").r_b / MM).round(9).tolist()  # x is the origin
+    [[0.0, 0.0, 0.0], [-47.0, 40.0, 2.0], [-25.0, -7.0, 25.0]]
     """
     if to not in GAUGES:
         raise InputError(f"gauge: expected one of {', '.join(GAUGES)}, got {to!r}")

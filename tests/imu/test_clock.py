@@ -142,7 +142,7 @@ def test_a_skew_that_no_clock_has_is_not_locked() -> None:
     assert sum(clock.report.stalls) == 0
 
 
-def test_the_time_on_the_wire_is_taken_off() -> None:
+def test_the_time_on_the_wire_is_subtracted() -> None:
     pulses = samples(15_000)
     pulses["arrival_ns"] = truth(pulses, 0.0) + 477_000
     clock = ClockModel(TAU, transmission_ns=477_000)
@@ -162,7 +162,7 @@ def test_before_the_lock_stamps_follow_the_least_delay() -> None:
     assert np.diff(stamps).min() == TAU // 2
 
 
-def test_a_better_line_is_gone_over_to_slowly() -> None:
+def test_a_better_fit_is_approached_slowly() -> None:
     pulses = samples(40_000)
     true = truth(pulses, 0.0)
     arrival = true + 2 * MS
@@ -176,7 +176,7 @@ def test_a_better_line_is_gone_over_to_slowly() -> None:
 
 
 @pytest.mark.parametrize("step_s", [0.006, 1.0, 3600.0])
-def test_a_host_clock_that_steps_back_begins_the_line_anew(step_s: float) -> None:
+def test_a_host_clock_that_steps_back_restarts_the_fit(step_s: float) -> None:
     pulses = samples(60_000)
     pulses["arrival_ns"] = truth(pulses, 0.0)
     pulses["arrival_ns"][30_000:] -= round(step_s * S)
@@ -211,7 +211,7 @@ def test_a_host_clock_that_steps_forward_is_followed_after_ten_seconds() -> None
     assert locked[50_250:].all()
 
 
-def test_a_restart_of_the_unit_begins_the_line_anew() -> None:
+def test_a_restart_of_the_unit_restarts_the_fit() -> None:
     before, after = samples(20_000, first=500_000), samples(20_000)
     after["elapsed_ns"] += before["elapsed_ns"][-1]  # as the tracker counts on
     before["arrival_ns"] = BEGIN + TAU * np.arange(20_000)
@@ -223,7 +223,7 @@ def test_a_restart_of_the_unit_begins_the_line_anew() -> None:
     assert locked[20_000 + LOCK :].all()
 
 
-def test_a_counter_that_went_around_unseen_begins_the_line_anew() -> None:
+def test_a_jump_of_the_counter_without_elapsed_time_restarts_the_fit() -> None:
     pulses = samples(20_000)
     pulses["arrival_ns"] = truth(pulses, 0.0)
     pulses["counter"][15_000:] += 7  # without elapsed time
@@ -232,7 +232,7 @@ def test_a_counter_that_went_around_unseen_begins_the_line_anew() -> None:
     assert not locked[15_000:].any()
 
 
-def test_a_sample_that_comes_twice_begins_the_line_anew_and_stamps_still_increase() -> None:
+def test_a_repeated_sample_restarts_the_fit_and_stamps_still_increase() -> None:
     pulses = samples(12_000)
     pulses["arrival_ns"] = truth(pulses, 0.0)
     stamps, locked = stamped(ClockModel(TAU), np.insert(pulses, 11_000, pulses[11_000]))
@@ -241,7 +241,7 @@ def test_a_sample_that_comes_twice_begins_the_line_anew_and_stamps_still_increas
     assert np.diff(stamps).min() > 0
 
 
-def test_a_host_clock_that_slept_through_a_gap_begins_the_line_anew() -> None:
+def test_a_host_clock_that_was_suspended_during_a_gap_restarts_the_fit() -> None:
     pulses = samples(60_000)
     pulses["arrival_ns"] = truth(pulses, 0.0)
     pulses = np.concatenate([pulses[:20_000], pulses[40_000:]])
@@ -264,7 +264,7 @@ def test_a_gap_that_the_counter_knows_keeps_the_lock() -> None:
     assert np.abs(stamps - pulses["arrival_ns"])[LOCK:].max() <= 1
 
 
-def test_a_gap_longer_than_the_window_begins_the_line_anew() -> None:
+def test_a_gap_longer_than_the_window_restarts_the_fit() -> None:
     pulses = samples(140_000)
     pulses["arrival_ns"] = truth(pulses, 50.0)
     pulses = np.concatenate([pulses[:20_000], pulses[120_000:]])
@@ -401,7 +401,7 @@ COEFFICIENTS = Coefficients(
 
 @given(cuts=st.lists(st.integers(0, 11_000), max_size=20))
 @settings(deadline=None, max_examples=25)
-def test_increments_that_come_later_get_the_stamps_of_their_samples(cuts: list[int]) -> None:
+def test_delayed_increments_get_the_stamps_of_their_samples(cuts: list[int]) -> None:
     layout = load("imu50-rs422").layout()
     true = truth(samples(11_000), 20.0)
     pulses = heard(true, np.random.default_rng(3))

@@ -278,7 +278,7 @@ def test_without_sensing_points_nothing_waits():
     assert not np.any(out["flags"] & Flag.SIZE_EFFECT)
 
 
-def test_counter_time_and_flags_are_handed_through():
+def test_counter_time_and_flags_are_passed_through():
     pulses = PULSES_OF_ALL_KINDS.copy()
     pulses["flags"][[10, 11]] = Flag.FAULT | Flag.SATURATED | Flag.WARM_UP
     out = compensate(pulses, replace(CALIBRATION, temperature=None), FILTERS["centred"])

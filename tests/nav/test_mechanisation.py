@@ -388,7 +388,7 @@ def test_navigation_from_a_site_starts_at_rest_at_its_place(gravity: float | Non
         (SITE, (1, 0, 0, 0), {"C_ba": np.eye(2)}, "expected C_ba"),
     ],
 )
-def test_a_start_that_makes_no_sense_is_refused(site: Any, q: Any, options: Any, message: str) -> None:
+def test_an_invalid_start_is_refused(site: Any, q: Any, options: Any, message: str) -> None:
     with pytest.raises(InputError, match=message):
         Navigator(*site, q, **options)
 

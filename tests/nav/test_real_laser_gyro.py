@@ -97,7 +97,7 @@ def level_deg(q_nb: NDArray[np.float64]) -> NDArray[np.float64]:
     return degrees
 
 
-def test_nothing_moves_in_the_quiet_window_and_people_are_seen_outside_it(log: Log) -> None:
+def test_the_quiet_window_is_at_rest_and_people_are_detected_outside_it(log: Log) -> None:
     assert log.aligned(*WINDOW).motion is None
     assert "moved" in str(log.aligned(960, 1320).motion)
 

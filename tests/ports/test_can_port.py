@@ -28,7 +28,7 @@ def _message(identifier=0x150, data=b"\x01\x02\x03", **more):
     return can.Message(arbitration_id=identifier, data=data, is_extended_id=identifier > 0x7FF, **more)
 
 
-def test_messages_come_as_records_stamped_when_they_came(can_profile, opened, arrivals):
+def test_messages_are_records_stamped_on_arrival(can_profile, opened, arrivals):
     port = opened("can://virtual/stamped", can_profile)
     assert port.source is Source.HARDWARE
     before = now_ns()
@@ -50,13 +50,13 @@ def test_messages_come_as_records_stamped_when_they_came(can_profile, opened, ar
     assert all(arrival.data.flags.writeable for arrival in found)
 
 
-def test_a_wait_in_vain_brings_no_messages(can_profile, opened):
+def test_a_timeout_returns_no_messages(can_profile, opened):
     nothing = opened("can://virtual/silent", can_profile).read(0.01).data
     assert nothing.dtype == MESSAGE
     assert nothing.size == 0
 
 
-def test_a_long_can_fd_message_comes_whole(canfd, opened, arrivals):
+def test_a_long_can_fd_message_is_received_complete(canfd, opened, arrivals):
     port = opened("can://virtual/fd", canfd)
     with _bus("fd", protocol=can.CanProtocol.CAN_FD) as unit:
         unit.send(_message(0x158, bytes(range(48)), is_fd=True, bitrate_switch=True))
@@ -65,7 +65,7 @@ def test_a_long_can_fd_message_comes_whole(canfd, opened, arrivals):
     assert bytes(message["data"]) == bytes(range(48)) + bytes(16)
 
 
-def test_only_data_of_the_units_own_identifiers_come(can_profile, opened, arrivals):
+def test_only_data_of_the_units_own_identifiers_are_received(can_profile, opened, arrivals):
     port = opened("can://virtual/busy", can_profile)
     with _bus("busy") as unit:
         for identifier in (0x7, 0x14F, 0x150, 0x18000150, 0x154):
@@ -142,7 +142,7 @@ def test_a_bus_that_goes_away_is_a_lost_port(bus, message):
 
 
 @pytest.mark.parametrize("nonsense", [ValueError("no number"), IndexError("dlc"), OTHER_ERROR])
-def test_nonsense_or_a_passing_error_is_no_message_and_no_loss(nonsense):
+def test_an_invalid_message_or_a_transient_error_is_no_message_and_no_loss(nonsense):
     port = CanPort("can://broken/0", Broken(nonsense))
     assert port.read(0).data.size == 0
     port.close()
@@ -156,7 +156,7 @@ def test_a_closed_port_is_closed_once_and_lost_when_read(can_profile, opened):
         port.read(0)
 
 
-def test_a_can_interface_that_is_not_there_is_a_lost_port(can_profile):
+def test_an_absent_can_interface_is_a_lost_port(can_profile):
     with pytest.raises(PortLostError, match=r"there is no CAN interface can77|kernel has no CAN"):
         open_port("can://socketcan/can77", can_profile)
 
@@ -189,7 +189,7 @@ def test_an_slcan_adapter_gets_the_data_bit_rate_of_a_can_fd_profile(adapter, ca
     assert b"S8\rY5\r" in os.read(far, 100)
 
 
-def test_an_slcan_adapter_that_is_pulled_is_lost_and_leaves_nothing_open(can_profile):
+def test_an_unplugged_slcan_adapter_is_lost_and_leaves_nothing_open(can_profile):
     far, near = os.openpty()
     tty.setraw(near)
     port = open_port(f"can://slcan/{os.ttyname(near)}?sleep_after_open=0", can_profile)
@@ -203,12 +203,12 @@ def test_an_slcan_adapter_that_is_pulled_is_lost_and_leaves_nothing_open(can_pro
     os.close(near)
 
 
-def test_an_slcan_adapter_that_is_not_there_names_the_ports_that_are(can_profile):
+def test_an_absent_slcan_adapter_is_reported_with_the_existing_ports(can_profile):
     with pytest.raises(PortLostError, match=r"there is no /dev/no-such; there (are|is)"):
         open_port("can://slcan//dev/no-such", can_profile)
 
 
-def test_an_interface_that_cannot_be_used_here_is_the_users_mistake(can_profile):
+def test_an_unusable_interface_is_a_mistake_of_the_user(can_profile):
     with pytest.raises(InputError, match="bitrate: expected at most 1000000"):
         open_port("can://virtual/x?bitrate=2000000", can_profile)
     with pytest.raises(InputError, match="Invalid bitrate, choose one of"):
@@ -226,7 +226,7 @@ with can.Bus({GROUP!r}, "udp_multicast", port=int(sys.argv[1]), ignore_config=Tr
 """
 
 
-def test_messages_of_another_process_come_all_in_order_and_a_strangers_datagram_is_ignored(canfd, opened):
+def test_messages_of_another_process_arrive_in_order_and_a_foreign_datagram_is_ignored(canfd, opened):
     pytest.importorskip("msgpack")
     number = 20_000 + os.getpid() % 20_000
     port = opened(f"can://udp_multicast/{GROUP}?port={number}", canfd)

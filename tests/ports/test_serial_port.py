@@ -56,7 +56,7 @@ def _url(server: socket.socket) -> str:
 @pytest.mark.parametrize(
     "form", ["{}", "serial://{}", "serial://{}?baudrate=115200", "alt://{}?class=VTIMESerial"]
 )
-def test_bytes_come_whole_and_stamped_when_they_came(form, line, rs422, opened, arrivals):
+def test_bytes_are_received_complete_and_stamped_on_arrival(form, line, rs422, opened, arrivals):
     port = opened(form.format(line.path), rs422)
     assert isinstance(port, DescriptorPort)
     assert port.source is Source.HARDWARE
@@ -69,7 +69,7 @@ def test_bytes_come_whole_and_stamped_when_they_came(form, line, rs422, opened, 
     assert port.read(0).data == b""
 
 
-def test_a_line_that_is_spied_on_is_read_through_pyserial(line, rs422, opened, arrivals, capfd):
+def test_a_spy_url_is_read_through_pyserial(line, rs422, opened, arrivals, capfd):
     port = opened(f"spy://{line.path}", rs422)
     assert isinstance(port, PyserialPort)
     os.write(line.unit, MANY)
@@ -81,7 +81,7 @@ def test_a_line_that_is_spied_on_is_read_through_pyserial(line, rs422, opened, a
     assert "F1 F2 F3 F4" in capfd.readouterr().err
 
 
-def test_what_a_port_holds_when_it_is_opened_is_not_thrown_away(line, rs422, opened, arrivals):
+def test_bytes_buffered_before_opening_are_not_discarded(line, rs422, opened, arrivals):
     os.write(line.unit, MANY)
     port = opened(line.path, rs422)
     assert b"".join(arrival.data for arrival in arrivals(port, len(MANY))) == MANY
@@ -155,7 +155,7 @@ def test_a_device_that_is_no_terminal_is_not_opened(rs422):
         (OSError(22, "Invalid argument"), InputError, r"Failed to set custom baud rate \(123457\)"),
     ],
 )
-def test_a_port_that_goes_while_it_is_opened_is_lost_and_a_speed_it_lacks_a_mistake(
+def test_a_port_that_vanishes_during_opening_is_lost_and_an_unsupported_speed_an_error(
     trouble, kind, message, line, rs422, monkeypatch
 ):
     def fail(self, speed):
@@ -171,7 +171,7 @@ def test_a_port_that_goes_while_it_is_opened_is_lost_and_a_speed_it_lacks_a_mist
         open_port(f"serial://{line.path}?baudrate=123457", rs422)
 
 
-def test_a_refusal_says_who_may_and_how_to_become_one(tmp_path):
+def test_a_refusal_names_the_group_with_access_and_how_to_join_it(tmp_path):
     device = tmp_path / "tty"
     device.touch()
     text = explain(str(device), PermissionError(13, "Permission denied"))
@@ -179,7 +179,7 @@ def test_a_refusal_says_who_may_and_how_to_become_one(tmp_path):
     assert f"no permission for {device}; its group is {group}: `sudo usermod -aG {group} $USER`" in text
 
 
-def test_the_stream_of_a_tcp_server_comes_whole_from_its_first_byte(server, rs422, opened, arrivals):
+def test_the_stream_of_a_tcp_server_is_received_complete(server, rs422, opened, arrivals):
     port = opened(_url(server), rs422)
     with server.accept()[0] as unit:
         unit.sendall(MANY * 40)
@@ -187,7 +187,7 @@ def test_the_stream_of_a_tcp_server_comes_whole_from_its_first_byte(server, rs42
         assert port.read(0).data == b""
 
 
-def test_a_tcp_server_that_hangs_up_is_a_lost_port_after_its_last_byte(server, rs422, opened):
+def test_a_tcp_server_that_closes_is_a_lost_port_after_its_last_byte(server, rs422, opened):
     port = opened(_url(server), rs422)
     with server.accept()[0] as unit:
         unit.sendall(b"last")
@@ -197,7 +197,7 @@ def test_a_tcp_server_that_hangs_up_is_a_lost_port_after_its_last_byte(server, r
             port.read(20)
 
 
-def test_a_tcp_server_that_is_not_there_is_a_lost_port(server, rs422):
+def test_an_absent_tcp_server_is_a_lost_port(server, rs422):
     url = _url(server)
     server.close()
     with pytest.raises(PortLostError, match=r"cannot connect: Connection refused; is the server running\?"):
@@ -227,11 +227,11 @@ def test_a_loop_is_read_through_pyserial(rs422, opened, arrivals, monkeypatch):
 @pytest.mark.parametrize(
     "url", ["loop://?colour=red", "rfc2217://127.0.0.1:1?colour=red", "alt:///dev/x?class=No"]
 )
-def test_an_option_that_pyserial_does_not_know_is_the_users_mistake(url, rs422):
+def test_an_option_unknown_to_pyserial_is_a_mistake_of_the_user(url, rs422):
     with pytest.raises(InputError, match=r"unknown option: 'colour'|unknown class: 'No'"):
         open_port(url, rs422)
 
 
-def test_a_port_described_to_pyserial_that_is_not_there_is_lost(rs422):
+def test_an_absent_port_given_by_a_pyserial_url_is_lost(rs422):
     with pytest.raises(PortLostError, match="no ports found matching"):
         open_port("hwgrep://no-such-device", rs422)

@@ -108,7 +108,7 @@ def test_a_closed_port_says_so_as_often_as_it_is_asked(run: Path) -> None:
         port.read(0.0)
 
 
-def test_the_end_is_told_every_time(run: Path) -> None:
+def test_the_end_is_reported_every_time(run: Path) -> None:
     port = open_port(f"sim://{run}?speed=max", profiles.load("imu50-rs422"))
     read_all_but_close = 0
     for _ in range(100_000):
@@ -130,6 +130,6 @@ def test_the_end_is_told_every_time(run: Path) -> None:
         ("sim://z-up?loop=1", "expected no option but speed, got loop"),
     ],
 )
-def test_a_url_without_sense_is_refused(url: str, message: str) -> None:
+def test_an_invalid_url_is_refused(url: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
         open_port(url, profiles.load("imu50-rs422"))

@@ -56,7 +56,7 @@ def test_a_quiet_line_changes_nothing(faults: Callable[..., Faults]) -> None:
     assert not damage.kind.any()
 
 
-def test_every_kind_comes_as_often_as_its_rate(faults: Callable[..., Faults]) -> None:
+def test_every_kind_of_fault_occurs_at_its_rate(faults: Callable[..., Faults]) -> None:
     n = 20_000
     _, _, damage = send(StreamFaults(faults(stream=STREAM_RATES), HEADER, 1), n)
     for kind, rate in zip(list(Kind)[1:9], STREAM_RATES.values(), strict=True):
@@ -190,7 +190,7 @@ def test_a_quiet_bus_changes_nothing(faults: Callable[..., Faults]) -> None:
     assert not damage.hit.any()
 
 
-def test_messages_are_lost_doubled_and_swapped_as_told(faults: Callable[..., Faults]) -> None:
+def test_messages_are_lost_doubled_and_swapped_as_reported(faults: Callable[..., Faults]) -> None:
     n = 20_000
     sent = messages_of(n)
     got, damage = MessageFaults(faults(can={"lost": 0.05, "doubled": 0.1, "swapped": 0.05}), 1).apply(sent)

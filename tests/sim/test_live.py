@@ -143,7 +143,7 @@ def test_a_pty_waits_for_its_reader_however_late(run: Scenario, player: Player) 
         assert read_to_the_end(fd) == whole(run, RS422)
 
 
-def test_an_unplugged_pty_comes_back_under_its_link(scenario: Make, player: Player, tmp_path: Path) -> None:
+def test_an_unplugged_pty_reappears_under_its_link(scenario: Make, player: Player, tmp_path: Path) -> None:
     out = [{"at_s": 0.2, "duration_s": 0.1}, {"at_s": 0.6, "duration_s": 0.1}]
     run = scenario({"rest": {"duration_s": 1.0}}, faults={**FAULTS, "unplugs": out})
     link = tmp_path / "imu"
@@ -162,7 +162,9 @@ def test_an_unplugged_pty_comes_back_under_its_link(scenario: Make, player: Play
     assert len(whole(silent, RS422)) > len(whole(run, RS422))
 
 
-def test_in_real_time_the_unit_goes_on_without_a_reader_and_says_so(scenario: Make, player: Player) -> None:
+def test_in_real_time_the_unit_continues_without_a_reader_and_reports_it(
+    scenario: Make, player: Player
+) -> None:
     run = scenario({"rest": {"duration_s": 1.0}}, faults={"unplugs": [{"at_s": 0.5, "duration_s": 0.1}]})
     with opened(player.start(run, RS422, "pty", 5.0)) as fd:
         first = read_to_the_end(fd)
@@ -250,7 +252,7 @@ def test_a_tcp_client_gets_the_bytes_of_the_capture(
     assert player.result().undelivered == 0
 
 
-def test_a_second_tcp_client_gets_what_comes_from_then_on(scenario: Make, player: Player) -> None:
+def test_a_second_tcp_client_gets_the_samples_from_then_on(scenario: Make, player: Player) -> None:
     run = scenario({"rest": {"duration_s": 1.0}})
     where = player.start(run, RS422, "tcp://127.0.0.1:0", 2.0)
     with connect(where) as first:
@@ -274,7 +276,7 @@ def test_an_unplugged_tcp_server_closes_and_listens_again(scenario: Make, player
     assert len(first) == 500 * 44
 
 
-def test_a_tcp_client_that_reads_nothing_is_cut_off_and_costs_the_others_nothing(
+def test_a_tcp_client_that_reads_nothing_is_disconnected_without_effect_on_others(
     scenario: Make, player: Player, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tcp, "TIMEOUT_S", 0.1)
@@ -349,7 +351,7 @@ def test_identifiers_of_29_bits_are_sent_as_such(run: Scenario, player: Player) 
         ("udp://127.0.0.1:5000", RS422, "expected pty, a serial port's path"),
     ],
 )
-def test_a_target_without_sense_is_refused(
+def test_an_invalid_target_is_refused(
     run: Scenario, player: Player, target: str, profile: profiles.Profile, message: str
 ) -> None:
     with pytest.raises(InputError, match=message):
@@ -361,7 +363,7 @@ def test_a_link_goes_with_a_pty_alone(run: Scenario, player: Player, tmp_path: P
         player.start(run, RS422, "tcp://:0", None, link=tmp_path / "imu")
 
 
-def test_a_stop_ends_the_run_with_its_books(scenario: Make, player: Player) -> None:
+def test_a_stopped_run_ends_with_its_counts(scenario: Make, player: Player) -> None:
     run = scenario({"rest": {"duration_s": 3600.0}})
     with opened(player.start(run, RS422, "pty", 1.0)) as fd:
         os.read(fd, 44)
@@ -399,7 +401,7 @@ def stopped_terminal() -> Iterator[int]:
     ("output", "code", "message"),
     [(full_disk, 2, "stdout: cannot be written: No space left on device"), (stopped_terminal, 0, "")],
 )
-def test_a_command_whose_text_nobody_takes_sends_all_the_same(
+def test_a_command_with_a_blocked_terminal_still_sends_everything(
     output: Callable[[], AbstractContextManager[int]], code: int, message: str, run: Scenario, tmp_path: Path
 ) -> None:
     settings_file.write(tmp_path / "run.yaml", run)

@@ -78,7 +78,7 @@ def velocity_n(integrals: Integrals, C_nb0: np.ndarray, interval_s: float) -> np
         ("y_up", (0, 1, 0), (0, 0, 1), (1, 0, 0)),
     ],
 )
-def test_poses_stand_as_the_bench_procedure_says(pose: str, X: ArrayLike, Y: ArrayLike, Z: ArrayLike) -> None:
+def test_poses_are_those_of_the_bench_procedure(pose: str, X: ArrayLike, Y: ArrayLike, Z: ArrayLike) -> None:
     np.testing.assert_array_equal(
         start_attitude(Start.model_validate({"pose": pose})), np.transpose([X, Y, Z])
     )

@@ -35,7 +35,7 @@ def test_the_three_poses_of_the_bench_procedure_are_shipped() -> None:
     assert [load(name).start.pose for name in ("x-up", "y-up", "z-up")] == ["x_up", "y_up", "z_up"]
 
 
-def test_an_unknown_name_tells_the_known_ones() -> None:
+def test_an_unknown_name_is_reported_with_the_known_ones() -> None:
     with pytest.raises(
         InputError, match=r"scenario 'w-up': expected one of rocking, .*there is no such file"
     ):

@@ -72,7 +72,7 @@ def size_effect(unit: TrueUnit, got: Chunk) -> np.ndarray:
     return out
 
 
-def test_pulses_taken_back_by_the_calibration_are_the_truth(scenario: Make) -> None:
+def test_pulses_converted_by_the_calibration_are_the_truth(scenario: Make) -> None:
     hot = {"start_degc": 40.0, "slope_k_per_h": 900.0}
     got = run(
         scenario(
@@ -314,7 +314,7 @@ def test_gravity_absent_from_the_site_is_the_normal_one(scenario: Make) -> None:
     ("interval_ns", "chunk", "message"),
     [(0, 1, "10 us to 1 s, got 0 ns"), (MS, 0, "at least one sample, got 0")],
 )
-def test_an_interval_or_chunk_without_sense_is_refused(
+def test_an_invalid_interval_or_chunk_is_refused(
     scenario: Make, interval_ns: int, chunk: int, message: str
 ) -> None:
     with pytest.raises(InputError, match=message):

@@ -62,7 +62,7 @@ def protocol(fd: bool) -> can.CanProtocol:
     return can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
 
 
-def test_what_the_outgoing_profile_cannot_say_is_dropped_and_counted(batch, wait_for) -> None:
+def test_samples_that_the_outgoing_profile_cannot_carry_are_dropped_and_counted(batch, wait_for) -> None:
     with can.Bus("narrow", "virtual") as bus:
         sink = CanSink("can://virtual/narrow?profile=imu50-can", SERIAL)
         wait_for(lambda: sink.state.state == "ok")
@@ -108,7 +108,9 @@ def test_temperatures_are_matched_by_sensor(
         sink.close()
 
 
-def test_a_driver_that_blocks_holds_nobody_and_costs_the_oldest_samples(batch, wait_for, monkeypatch) -> None:
+def test_a_blocking_driver_delays_nothing_else_and_loses_the_oldest_samples(
+    batch, wait_for, monkeypatch
+) -> None:
     go, begun = threading.Event(), threading.Event()
     send = can.interfaces.virtual.VirtualBus.send
 
@@ -134,7 +136,7 @@ def test_a_driver_that_blocks_holds_nobody_and_costs_the_oldest_samples(batch, w
         sink.close()
 
 
-def test_a_bus_that_is_not_there_or_fails_is_told_and_opened_again(batch, wait_for, monkeypatch) -> None:
+def test_an_absent_or_failing_bus_is_reported_and_reopened(batch, wait_for, monkeypatch) -> None:
     monkeypatch.setattr(can_sink, "_RETRY_S", 0.05)
     broken = True
     send = can.interfaces.virtual.VirtualBus.send
@@ -167,6 +169,6 @@ def test_a_bus_that_is_not_there_or_fails_is_told_and_opened_again(batch, wait_f
         ("can://virtual/x?profile=tools/psins-100hz.yaml", "psins-100hz"),
     ],
 )
-def test_a_gateway_that_cannot_be_is_refused(url: str, told: str) -> None:
+def test_an_impossible_gateway_is_refused(url: str, told: str) -> None:
     with pytest.raises(InputError, match=told):
         CanSink(url, SERIAL)

@@ -78,7 +78,7 @@ def test_udp_brings_every_sample_in_order_in_packets_that_no_network_splits(batc
         sink.close()
 
 
-def test_nothing_is_lost_from_the_moment_a_udp_receiver_is_there(batch) -> None:
+def test_nothing_is_lost_once_a_udp_receiver_listens(batch) -> None:
     with receiver() as udp:
         port = udp.getsockname()[1]
     sink = UdpSink(f"udp://127.0.0.1:{port}")
@@ -99,7 +99,7 @@ def test_nothing_is_lost_from_the_moment_a_udp_receiver_is_there(batch) -> None:
     sink.close()
 
 
-def test_an_unreachable_network_is_reported_and_costs_samples_only(batch, wait_for, monkeypatch) -> None:
+def test_an_unreachable_network_is_reported_and_only_loses_samples(batch, wait_for, monkeypatch) -> None:
     def unreachable(self: socket.socket, address: object) -> None:
         raise OSError(101, "Network is unreachable")
 
@@ -118,24 +118,24 @@ def test_an_unreachable_network_is_reported_and_costs_samples_only(batch, wait_f
 @pytest.mark.parametrize(
     "url", ["udp://", "udp://host", "udp://127.0.0.1:99999", "udp://:5000", "udp://h:1/x"]
 )
-def test_a_udp_address_that_makes_no_sense_is_refused(url: str) -> None:
+def test_an_invalid_udp_address_is_refused(url: str) -> None:
     with pytest.raises(InputError, match="expected udp://HOST:PORT"):
         UdpSink(url)
 
 
-def test_a_host_that_nobody_knows_is_refused() -> None:
+def test_an_unknown_host_is_refused() -> None:
     with pytest.raises(InputError, match=r"no-such-host\.invalid.*check the name"):
         UdpSink("udp://no-such-host.invalid:5000")
 
 
-def test_tcp_serves_this_machine_only_unless_told_otherwise(tcp: TcpSink) -> None:
+def test_tcp_serves_only_this_machine_by_default(tcp: TcpSink) -> None:
     assert tcp.state.state.startswith("waiting for a client on 127.0.0.1:")
     assert tcp.state.healthy
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.2", port_of(tcp)), timeout=20)
 
 
-def test_tcp_brings_every_client_every_sample_from_its_coming_on(tcp: TcpSink, batch, wait_for) -> None:
+def test_a_tcp_client_gets_every_sample_from_its_connection_on(tcp: TcpSink, batch, wait_for) -> None:
     tcp.publish(batch(0, 1))
     with connect(tcp, wait_for) as one:
         tcp.publish(batch(1, 1))
@@ -147,7 +147,7 @@ def test_tcp_brings_every_client_every_sample_from_its_coming_on(tcp: TcpSink, b
     assert tcp.state[3:] == (201, 0, 0)
 
 
-def test_a_tcp_client_that_stops_reading_loses_its_own_oldest_samples_and_no_one_elses(
+def test_a_tcp_client_that_stops_reading_loses_only_its_own_oldest_samples(
     tcp: TcpSink, batch, wait_for
 ) -> None:
     samples = 100_000  # 7.6 MB: more than the queue of the sink and the buffers of the system hold
@@ -182,7 +182,7 @@ def test_a_tcp_client_that_stops_reading_loses_its_own_oldest_samples_and_no_one
     assert tcp.state.queued == 0
 
 
-def test_tcp_clients_come_and_go_and_talk_in_vain(tcp: TcpSink, batch, wait_for) -> None:
+def test_tcp_clients_connect_and_disconnect_and_their_input_is_ignored(tcp: TcpSink, batch, wait_for) -> None:
     for n in range(5):
         with connect(tcp, wait_for) as client:
             client.sendall(b"GET / HTTP/1.0\r\n\r\n" * 1000)
@@ -194,14 +194,14 @@ def test_tcp_clients_come_and_go_and_talk_in_vain(tcp: TcpSink, batch, wait_for)
     assert tcp.state.state.startswith("waiting for a client")
 
 
-def test_a_tcp_client_that_was_killed_is_found_out_by_writing(tcp: TcpSink, batch, wait_for) -> None:
+def test_a_killed_tcp_client_is_detected_by_writing(tcp: TcpSink, batch, wait_for) -> None:
     client = connect(tcp, wait_for)
     client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")  # close with a reset
     client.close()
     wait_for(lambda: tcp.publish(batch(0, 1)) or not clients_of(tcp))
 
 
-def test_more_tcp_clients_than_there_is_room_for_are_sent_away(tcp: TcpSink, wait_for) -> None:
+def test_tcp_clients_beyond_the_maximum_are_refused(tcp: TcpSink, wait_for) -> None:
     clients = [connect(tcp, wait_for) for _ in range(MAX_CLIENTS)]
     with socket.create_connection(("127.0.0.1", port_of(tcp)), timeout=20) as late:
         tcp.poll()
@@ -225,7 +225,7 @@ def test_closing_a_tcp_sink_sends_what_is_queued(batch, wait_for) -> None:
     assert sink.state[3:] == (put, 0, 0)
 
 
-def test_a_port_that_is_taken_is_refused_before_the_start(tcp: TcpSink) -> None:
+def test_a_port_in_use_is_refused_before_the_start(tcp: TcpSink) -> None:
     with pytest.raises(InputError, match="expected an address of this machine and a free port"):
         TcpSink(f"tcp://127.0.0.1:{port_of(tcp)}")
 

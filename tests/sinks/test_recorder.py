@@ -85,7 +85,7 @@ def test_the_library_itself_reads_all_that_was_recorded(batch, tmp_path: Path) -
         assert len(list(NonSeekingReader(file).iter_messages())) == len(messages)
 
 
-def test_can_messages_come_back_exactly(batch, tmp_path: Path) -> None:
+def test_can_messages_are_recorded_exactly(batch, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     recorder = open_recorder(path, "imu50-canfd", None)
     rng = np.random.default_rng(1)
@@ -108,7 +108,7 @@ def test_can_messages_come_back_exactly(batch, tmp_path: Path) -> None:
     assert recording.profile.name == "imu50-canfd"
 
 
-def test_wire_bytes_stand_before_what_was_made_of_them(batch, tmp_path: Path) -> None:
+def test_wire_bytes_are_recorded_before_their_increments(batch, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     recorder = open_recorder(path)
     for n in range(5):
@@ -120,7 +120,7 @@ def test_wire_bytes_stand_before_what_was_made_of_them(batch, tmp_path: Path) ->
     assert topics == ["/imu50/wire"] * 5 + ["/imu50/increments"]
 
 
-def test_a_recording_that_exists_is_not_touched(tmp_path: Path) -> None:
+def test_an_existing_recording_is_not_changed(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     path.write_bytes(b"mine")
     with pytest.raises(InputError, match=r"run\.mcap: expected a new file.*another name"):
@@ -128,7 +128,7 @@ def test_a_recording_that_exists_is_not_touched(tmp_path: Path) -> None:
     assert path.read_bytes() == b"mine"
 
 
-def test_a_full_disk_is_told_and_passes_without_spoiling_the_file(
+def test_a_full_disk_is_reported_and_leaves_the_file_intact(
     batch, wait_for, tmp_path: Path, monkeypatch
 ) -> None:
     room = 12_000
@@ -200,7 +200,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", str(path)], check=True)
 
 
-def test_a_really_full_disk_ends_when_somebody_makes_room(batch, wait_for, small_disk: Path) -> None:
+def test_recording_continues_when_a_full_disk_has_room_again(batch, wait_for, small_disk: Path) -> None:
     filler = small_disk / "filler"
     filler.write_bytes(bytes(60_000))
     path = small_disk / "run.mcap"
@@ -304,7 +304,7 @@ def test_a_kill_loses_nothing_that_was_read_a_quarter_of_a_second_before(tmp_pat
         assert len(got) >= len(old)
 
 
-def test_nothing_that_waits_is_without_bound(batch, tmp_path: Path, monkeypatch) -> None:
+def test_every_queue_is_bounded(batch, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(recorder_module, "QUEUE_BYTES", 100 * (SIZE + 64))
     monkeypatch.setattr("imudrv.files.spool.PERIOD_S", 3600)
     recorder = open_recorder(tmp_path / "run.mcap")

@@ -50,7 +50,7 @@ def test_a_line_gets_every_sample_in_order(batch, wait_for) -> None:
     line.close()
 
 
-def test_a_line_that_is_stuck_holds_nobody_and_loses_its_oldest_samples(batch, wait_for) -> None:
+def test_a_stuck_line_delays_nothing_else_and_loses_its_oldest_samples(batch, wait_for) -> None:
     line = Line()
     sink = SerialSink(f"serial://{line.path}")
     wait_for(lambda: sink.poll() or sink.state.state == "ok")
@@ -70,7 +70,7 @@ def test_a_line_that_is_stuck_holds_nobody_and_loses_its_oldest_samples(batch, w
     line.close()
 
 
-def test_a_port_that_is_absent_or_unplugged_is_opened_once_it_is_there(
+def test_an_absent_or_unplugged_port_is_opened_once_it_exists(
     batch, wait_for, tmp_path: Path, monkeypatch
 ) -> None:
     monkeypatch.setattr("imudrv.sinks.serial._RETRY_S", 0.0)
@@ -95,7 +95,7 @@ def test_a_port_that_is_absent_or_unplugged_is_opened_once_it_is_there(
     sink.close()
 
 
-def test_closing_does_not_wait_for_a_line_that_is_stuck(batch, wait_for) -> None:
+def test_closing_does_not_wait_for_a_stuck_line(batch, wait_for) -> None:
     line = Line()
     sink = SerialSink(f"serial://{line.path}")
     wait_for(lambda: sink.poll() or sink.state.state == "ok")
@@ -115,6 +115,6 @@ def test_closing_does_not_wait_for_a_line_that_is_stuck(batch, wait_for) -> None
         ("serial:///dev/ttyUSB0?parity=E", "parity: expected 'none'"),
     ],
 )
-def test_settings_that_make_no_sense_are_refused(url: str, told: str) -> None:
+def test_invalid_settings_are_refused(url: str, told: str) -> None:
     with pytest.raises(InputError, match=told):
         SerialSink(url)

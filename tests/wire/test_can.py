@@ -107,7 +107,7 @@ def counters(frames) -> list[int]:
 
 
 @pytest.mark.parametrize("layout", [CAN, CANFD, STRANGE], ids=lambda layout: layout.name)
-def test_what_was_sent_comes_back(layout):
+def test_what_was_sent_is_decoded(layout):
     sent = pulses(700, first=2**32 - 350)
     frames, rejects = fed(CanAssembler(layout), *np.array_split(CanEncoder(layout).encode(sent), 11))
     assert rejects.size == 0
@@ -136,7 +136,7 @@ def test_the_bytes_of_the_icd_are_read():
     assert frame["accelerometer"].tolist() == [0, 1, 20]
 
 
-def test_temperatures_and_status_hold_from_their_message_on():
+def test_temperatures_and_status_are_valid_from_their_message_on():
     frames, _ = fed(
         CanAssembler(CAN), sample(1), status(1, 5), sample(2), temperatures(1, -2, 3, 4), sample(3), sample(4)
     )
@@ -145,7 +145,7 @@ def test_temperatures_and_status_hold_from_their_message_on():
     assert frames["status"].tolist() == [0, 5, 5, 5]
 
 
-def test_samples_are_held_until_the_full_counter_comes():
+def test_samples_are_held_until_the_full_counter_arrives():
     assembler = CanAssembler(CAN)
     before, _ = fed(assembler, *(sample(c) for c in range(65530, 65540)))
     assert before.size == 0
@@ -179,7 +179,7 @@ def test_without_a_full_counter_samples_go_out_counted_from_the_first_ones_own()
     assert counters(fed(assembler, sample(first + HOLD + 1))[0]) == [first + HOLD + 1]
 
 
-def test_a_full_counter_that_disagrees_is_believed_from_then_on_and_counted():
+def test_a_full_counter_that_disagrees_is_used_from_then_on_and_counted():
     assembler = CanAssembler(CAN)
     frames, _ = fed(assembler, sample(10), status(10), sample(11), status(4 * 65536 + 11), sample(12))
     assert counters(frames) == [10, 11, 4 * 65536 + 12]
@@ -203,7 +203,7 @@ def test_a_torn_sample_is_a_reject_and_counted_in_the_next_frame():
     assert rejects.tolist() == [(3, 1, Reason.TORN)]
 
 
-def test_interleaved_neighbours_are_put_apart():
+def test_interleaved_neighbours_are_separated():
     # Four open at once, each complete in its turn.
     halves = [gyro(c) for c in range(4)] + [accelerometer(c) for c in range(4)]
     frames, rejects = fed(CanAssembler(CAN), status(0), *halves)
@@ -212,7 +212,7 @@ def test_interleaved_neighbours_are_put_apart():
     assert rejects.size == 0
 
 
-def test_one_open_sample_too_many_gives_up_the_first():
+def test_one_open_sample_too_many_abandons_the_first():
     halves = [gyro(c) for c in range(OPEN_SAMPLES + 1)] + [
         accelerometer(c) for c in range(1, OPEN_SAMPLES + 1)
     ]
@@ -256,7 +256,7 @@ def test_a_message_a_little_behind_is_stale_and_one_far_behind_is_a_restart():
     assert assembler.counter_disagreements == 0
 
 
-def test_a_restart_lets_held_samples_go():
+def test_a_restart_releases_held_samples():
     assembler = CanAssembler(CAN)
     frames, _ = fed(assembler, sample(5000), sample(5001), gyro(0))
     assert counters(frames) == [5000, 5001]
@@ -287,7 +287,7 @@ def test_a_wrong_length_is_a_reject_and_damages_the_next_frame():
 
 
 @pytest.mark.parametrize("length", [0, 64, 65, 255])
-def test_no_length_leads_out_of_the_data(length):
+def test_no_length_reads_beyond_the_data(length):
     odd = gyro(1)
     odd["length"] = length
     _, rejects = fed(CanAssembler(CAN), odd)
@@ -312,7 +312,7 @@ def test_a_wrong_constant_fails_the_check():
     assert rejects.tolist() == [(2, 1, Reason.CHECK_FAILED)]
 
 
-def test_the_end_lets_held_samples_go_and_tears_open_ones():
+def test_the_end_releases_held_samples_and_counts_open_ones_as_torn():
     assembler = CanAssembler(CAN)
     fed(assembler, sample(7), accelerometer(9), gyro(8))
     frames, rejects = assembler.close()
@@ -343,7 +343,7 @@ MESSAGES = st.one_of(
 
 @settings(deadline=None, max_examples=200)
 @given(st.lists(MESSAGES, max_size=25), st.lists(st.integers(0, 60), max_size=6))
-def test_any_messages_in_any_pieces_give_the_same_items_and_each_has_one_place(groups, cuts):
+def test_any_messages_in_any_pieces_give_the_same_items_and_each_is_counted_once(groups, cuts):
     messages = np.concatenate([np.zeros(0, MESSAGE), *groups])
     whole = CanAssembler(QUICK)
     frames, rejects = joined([whole.feed(messages), whole.close()])

@@ -133,7 +133,7 @@ def test_a_line_becomes_its_message(line, message):
         b"x",
     ],
 )
-def test_a_bad_line_is_one_reject_and_costs_no_other(line):
+def test_a_bad_line_is_one_reject_and_affects_no_other(line):
     text = GOOD + line + b"\n" + GOOD
     messages, rejects = decoded(text)
     assert messages.size == 2
@@ -274,7 +274,7 @@ def lines_of(*channels: str) -> bytes:
     return b"".join(format_candump(record(0, n, b""), channel) for n, channel in enumerate(channels))
 
 
-def test_only_the_first_or_the_chosen_channel_comes_out() -> None:
+def test_only_the_first_or_the_chosen_channel_is_decoded() -> None:
     log = lines_of("can1", "can0", "can1", "can10", "can", "can0")
     for channel, ids in ((None, [0, 2]), ("can1", [0, 2]), ("can0", [1, 5]), ("can", [4]), ("can2", [])):
         messages, rejects, channels = decoded_channel(channel, log)
@@ -288,7 +288,7 @@ def test_a_line_that_is_no_message_chooses_no_channel() -> None:
     assert (messages.size, channels) == (2, {"can0": 2})
 
 
-def test_a_log_of_more_channels_than_are_told_apart_is_counted_whole() -> None:
+def test_a_log_of_more_channels_than_are_distinguished_is_counted_completely() -> None:
     names = [f"can{n}" for n in range(MOST_CHANNELS + 3)]
     messages, _, channels = decoded_channel("can2", lines_of(*names * 2))
     assert messages["id"].tolist() == [2, 2 + len(names)]
@@ -324,7 +324,7 @@ def test_a_channel_that_is_not_in_the_log_is_refused_at_its_end(channel: str) ->
         decoder.check_channel("any.log", "--channel ")
 
 
-def test_names_of_channels_cannot_steer_a_terminal() -> None:
+def test_names_of_channels_cannot_control_a_terminal() -> None:
     decoder = CandumpDecoder()
     decoder.feed(b"(1.0) \x9b31m 150#00\n(1.0) \xe2\x80\xae 150#00\n")
     assert list(decoder.channels) == [r"\x9b31m", r"\xe2\x80\xae"]

@@ -36,7 +36,7 @@ def check_value(check: Check, message: bytes, before: bytes = b"", behind: bytes
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
-def test_the_published_check_values_come_out(name):
+def test_the_published_check_values_are_computed(name):
     check, published = PUBLISHED[name]
     assert check_value(check, b"123456789") == published
 

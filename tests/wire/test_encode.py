@@ -74,7 +74,7 @@ def worked_sample() -> np.ndarray:
     return pulses
 
 
-def test_the_worked_frame_of_the_icd_comes_out_byte_for_byte():
+def test_the_worked_frame_of_the_icd_is_encoded_byte_for_byte():
     (row,) = StreamEncoder(RS422).encode(worked_sample())
     assert row.tobytes() == WORKED
 
@@ -134,7 +134,7 @@ def test_totals_add_up_across_calls_and_wrap():
         assert np.array_equal(frames[name], totals % 65536)
 
 
-def test_a_refused_sample_does_not_move_the_totals():
+def test_a_refused_sample_does_not_change_the_totals():
     encoder = StreamEncoder(TOTALS)
     wild = samples()
     wild["gyro"] = 40_000
@@ -196,7 +196,7 @@ def test_a_counter_goes_out_modulo_its_width():
     assert frames["counter"].tolist() == [2**32 - 1, 0, 1]
 
 
-def test_byte_order_turns_the_bytes_of_each_number_round():
+def test_byte_order_reverses_the_bytes_of_each_number():
     turned = replace(RS422, big_endian=True)
     (little,) = StreamEncoder(RS422).encode(samples())
     (big,) = StreamEncoder(turned).encode(samples())

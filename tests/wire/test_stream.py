@@ -103,19 +103,19 @@ def test_a_frame_carries_the_time_of_the_bytes_that_completed_it():
     assert decoder.feed(WORKED[1:], 3).frames["t_ns"].tolist() == [3]
 
 
-def test_a_frame_tells_how_many_frames_worth_of_bytes_were_rejected_before_it():
+def test_a_frame_has_the_number_of_frame_lengths_rejected_before_it():
     data = WORKED + DAMAGED + DAMAGED[:30] + WORKED + WORKED + b"\x00" + WORKED
     assert decode(data).frames["damaged"].tolist() == [0, 2, 0, 1]
 
 
-def test_more_rejects_than_one_scan_has_room_for_all_come_out():
+def test_more_rejects_than_fit_in_one_scan_are_all_returned():
     found = decode(DAMAGED * 3000 + WORKED)
     assert found.rejects["offset"].tolist() == list(range(0, 3000 * LENGTH, LENGTH))
     assert found.frames["damaged"].tolist() == [3000]
 
 
 @pytest.mark.parametrize("axis", ["x", "y", "z"])
-def test_a_reference_capture_decodes_to_every_frame_and_its_account_closes(reference, axis):
+def test_a_reference_capture_decodes_to_every_frame_and_its_counts_add_up(reference, axis):
     data = (reference / f"{axis}_up.raw").read_bytes()
     found = decode(data)
     assert len(found.frames) == 74_500
@@ -129,14 +129,14 @@ def test_a_reference_capture_decodes_to_every_frame_and_its_account_closes(refer
     assert np.all(np.diff(pulses["elapsed_ns"]) == 1_000_000)
 
 
-def test_the_reference_capture_with_x_up_goes_across_the_counters_wrap(reference):
+def test_the_reference_capture_with_x_up_contains_a_wrap_of_the_counter(reference):
     counters = decode((reference / "x_up.raw").read_bytes()).frames["counter"]
     (wrap,) = np.flatnonzero(np.diff(counters) != 1)
     assert (counters[wrap], counters[wrap + 1]) == (2**32 - 1, 0)
 
 
 @pytest.mark.parametrize("axis", ["x", "y", "z"])
-def test_damage_costs_exactly_the_damaged_frames_in_any_chunks(reference, axis):
+def test_damage_loses_exactly_the_damaged_frames_in_any_chunks(reference, axis):
     raw = (reference / f"{axis}_up.raw").read_bytes()
     frames = np.frombuffer(raw, np.uint8).reshape(-1, LENGTH)
     kinds = StreamRates.model_fields
