@@ -62,7 +62,7 @@ CPU_PERCENT: Final = 15.0
 RSS_MB: Final = 250.0
 GROWTH_MB: Final = 5.0
 """Flat: in ten hours a leak of one byte a sample would be 36 MB; the allocator alone settles within 2."""
-DEADLINE_S: Final = 60.0
+DEADLINE_S: Final = 300.0
 """Only ends what is broken."""
 
 Status = dict[str, Any]
@@ -264,6 +264,7 @@ def listen(url: str, path: Path) -> None:
         print("listening", flush=True)
         while not stop.is_set():
             got.extend(receiver)
+        got.extend(receiver)  # what came in the last moment
     np.save(path, np.concatenate(got))
     print(f"lost {receiver.lost}, {receiver.rejected_bytes} bytes of something else")
 
@@ -733,6 +734,7 @@ def unplug(folder: Path, seconds: float, speed: float = 10.0) -> list[Check]:
         counts, status = last_status(recording)
         own = np.concatenate(list(recording.increments()))
         reads = [(arrival.t_ns, len(arrival.data)) for arrival in recording.arrivals()]
+        absent_states = {s["sinks"][1]["state"] for _, s in recording.statuses()}
         told_ns = next((t_ns for t_ns, s in recording.statuses() if s["port"]["state"] == "lost"), 0)
         done("compensate", path, "-o", folder / "offline.npz")
     got: Records = np.load(folder / "got.npy")
@@ -758,8 +760,8 @@ def unplug(folder: Path, seconds: float, speed: float = 10.0) -> list[Check]:
         ),
         Check(
             "a UDP receiver that is not there is told and counted",
-            f"{nobody['state']}, {nobody['dropped']:,} dropped",
-            nobody["state"] == "nobody listens" and nobody["dropped"] > 0,
+            f"{', '.join(sorted(absent_states))}; {nobody['dropped']:,} dropped",
+            "nobody listens" in absent_states and nobody["dropped"] > 0,
         ),
         Check(
             "a TCP client that stops reading loses its own samples, counted",

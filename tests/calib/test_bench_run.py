@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from realtime import DEADLINE_S
 from rich.console import Console
 
 from calib.bench.entries import Plan, from_json
@@ -50,7 +51,6 @@ poses:
   - {id: y-up, up: +Y, east: +Z, turn_deg: 180}
 """
 STEPS = ["z-up", "x-up", "y-up"]
-DEADLINE_S = 300.0
 RUN = """
 import sys
 from pathlib import Path
@@ -98,7 +98,7 @@ def journal(folder: Path) -> list[dict[str, Any]]:
 
 
 def until(process: subprocess.Popen[str], true: Callable[[], bool]) -> None:
-    """Wait for an outcome; the deadline only ends a broken test."""
+    """Wait for an outcome, or for the end of a process that should run."""
     end = time.monotonic() + DEADLINE_S
     while not true():
         if process.poll() is not None or time.monotonic() > end:
