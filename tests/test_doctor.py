@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from realtime import DEADLINE_S, free_port
 
 from imudrv import diagnosis, profiles
 from imudrv.doctor import device, traffic
@@ -34,7 +35,8 @@ from imudrv.sim.scenario import Scenario
 RS422, ACC, CAN, CANFD = (
     profiles.load(name) for name in ("imu50-rs422", "imu50-rs422-acc", "imu50-can", "imu50-canfd")
 )
-LISTEN_S = 0.5
+LISTEN_S = (0.5, 2.0, 8.0, 30.0)
+"""Times to listen until all has come: a busy machine may hold back samples, or bring them in bursts."""
 
 
 def scenario(duration_s: float, **sections: Any) -> Scenario:
@@ -62,7 +64,7 @@ def playing() -> Iterator[Callable[[Profile, str], str]]:
         def start(profile: Profile, target: str = "pty", **sections: Any) -> str:
             said: Queue[str] = Queue()
             pool.submit(play, scenario(600.0, **sections), profile, target, 1.0, said.put, None, stop)
-            return said.get(timeout=20).split()[-1]
+            return said.get(timeout=DEADLINE_S).split()[-1]
 
         yield start
         stop.set()
@@ -78,14 +80,29 @@ def line() -> Iterator[tuple[int, str]]:
     os.close(master)
 
 
+def examined(
+    url: str, profile: str | None, right: Callable[[dict[str, Finding]], bool]
+) -> dict[str, Finding]:
+    """Examine a port again, and longer, until the findings are right."""
+    for listen_s in LISTEN_S:
+        steps = by_name(examine(url, profile, listen_s))
+        if right(steps):
+            break
+    return steps
+
+
+def is_healthy(steps: dict[str, Finding]) -> bool:
+    return all(step.verdict is not Verdict.FAIL for step in steps.values())
+
+
 def by_name(steps: Any) -> dict[str, Finding]:
     return {step.name: step for step in steps}
 
 
 @pytest.mark.parametrize("profile", [RS422, ACC])
 def test_a_unit_of_the_right_profile_is_healthy(profile: Profile, playing: Any) -> None:
-    steps = by_name(examine(playing(profile), profile.name, LISTEN_S))
-    assert all(step.verdict is not Verdict.FAIL for step in steps.values()), steps
+    steps = examined(playing(profile), profile.name, is_healthy)
+    assert is_healthy(steps), steps
     assert list(steps)[:6] == ["device", "permission", "busy", "line load", "open", "data"]
     assert "good frames" in steps["data"].found
     assert "samples/s by the counter, 0 lost" in steps["data"].found
@@ -94,9 +111,15 @@ def test_a_unit_of_the_right_profile_is_healthy(profile: Profile, playing: Any) 
 
 
 def test_the_command_reports_each_step_and_the_result(playing: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(examination, "LISTEN_S", LISTEN_S)
     said: list[str] = []
-    assert examination.doctor(playing(RS422), "imu50-rs422", said.append)
+    port = playing(RS422)
+
+    def is_reported_healthy(listen_s: float) -> bool:
+        said.clear()
+        monkeypatch.setattr(examination, "LISTEN_S", listen_s)
+        return examination.doctor(port, "imu50-rs422", said.append)
+
+    assert any(map(is_reported_healthy, LISTEN_S)), said
     assert said[0].startswith("  ok  device: /dev/pts/")
     assert said[-1] == "healthy"
     said.clear()
@@ -106,7 +129,7 @@ def test_the_command_reports_each_step_and_the_result(playing: Any, monkeypatch:
 
 
 def test_for_a_wrong_profile_the_right_one_is_named(playing: Any) -> None:
-    steps = by_name(examine(playing(ACC), "imu50-rs422", LISTEN_S))
+    steps = examined(playing(ACC), "imu50-rs422", lambda steps: "looks like" in steps["data"].found)
     data = steps["data"]
     assert data.verdict is Verdict.FAIL
     assert "sync EB 90 found" in data.found
@@ -115,14 +138,14 @@ def test_for_a_wrong_profile_the_right_one_is_named(playing: Any) -> None:
 
 
 def test_without_a_profile_the_right_one_is_found(playing: Any) -> None:
-    steps = by_name(examine(playing(ACC), None, LISTEN_S))
+    steps = examined(playing(ACC), None, lambda steps: "profile" in steps and is_healthy(steps))
     assert steps["profile"].found == "the data fits imu50-rs422-acc: --profile imu50-rs422-acc"
     assert steps["data"].verdict is Verdict.OK
 
 
 def test_a_line_that_damages_frames_is_a_failure(playing: Any) -> None:
     path = playing(RS422, faults={"stream": {"bit_flips": 0.2}})
-    data = by_name(examine(path, "imu50-rs422", LISTEN_S))["data"]
+    data = examined(path, "imu50-rs422", lambda steps: "damaged" in steps["data"].found)["data"]
     assert data.verdict is Verdict.FAIL
     assert "x check failed" in data.found
     assert "damaged" in data.found
@@ -146,7 +169,7 @@ def test_garbage_fits_nothing(line: tuple[int, str]) -> None:
 
     with ThreadPoolExecutor(1) as pool:
         pool.submit(speak)
-        data = by_name(examine(line[1], "imu50-rs422", 0.3))["data"]
+        data = examined(line[1], "imu50-rs422", lambda steps: "silence" not in steps["data"].found)["data"]
         stop.set()
     assert data.verdict is Verdict.FAIL
     assert "no shipped profile fits at any usual baud rate" in data.found
@@ -156,7 +179,7 @@ def test_a_port_that_is_lost_meanwhile_is_reported() -> None:
     with ThreadPoolExecutor(1) as pool:
         said: Queue[str] = Queue()
         pool.submit(play, scenario(0.3), RS422, "pty", 1.0, said.put)
-        data = by_name(examine(said.get(timeout=20).split()[-1], "imu50-rs422", 20.0))["data"]
+        data = by_name(examine(said.get(timeout=DEADLINE_S).split()[-1], "imu50-rs422", DEADLINE_S))["data"]
     assert data.verdict is Verdict.FAIL
     assert "plug, cable and adapter" in data.fix
 
@@ -324,17 +347,20 @@ def test_a_can_interface_that_is_up_is_ok(system: System) -> None:
 
 @pytest.mark.parametrize("profile", [CAN, CANFD])
 def test_a_unit_on_a_bus_is_healthy_and_its_identifiers_are_counted(profile: Profile, playing: Any) -> None:
-    bus = "can://udp_multicast/239.74.163.11?port=43221"
+    bus = f"can://udp_multicast/239.74.163.11?port={free_port()}"
     playing(profile, bus)
-    steps = by_name(examine(bus, profile.name, LISTEN_S))
+    steps = examined(bus, profile.name, lambda steps: steps["data"].verdict is Verdict.OK)
     assert steps["data"].verdict is Verdict.OK, steps
     assert ("150 " if profile is CAN else "158 ") in steps["data"].found
 
 
-def test_for_a_unit_with_another_can_profile_the_right_one_is_named(playing: Any) -> None:
+def test_for_a_unit_with_another_can_profile_the_right_one_is_named(
+    playing: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     bus = "can://virtual/doctor"
+    monkeypatch.setattr(examination, "_TRY_S", 3.0)
     playing(CANFD, bus)
-    steps = by_name(examine(bus, "imu50-can", LISTEN_S))
+    steps = examined(bus, "imu50-can", lambda steps: "looks like" in steps["data"].found)
     assert steps["data"].verdict is Verdict.FAIL
     assert steps["data"].found == "0 messages of imu50-can, no complete sample: this looks like imu50-canfd"
     assert steps["data"].fix == "use --profile imu50-canfd"

@@ -94,7 +94,7 @@ def process(arguments: str) -> list[str]:
 
 
 def piped(arguments: str, folder: Path) -> subprocess.CompletedProcess[bytes]:
-    return subprocess.run(process(arguments), cwd=folder, check=True, capture_output=True, timeout=120)
+    return subprocess.run(process(arguments), cwd=folder, check=True, capture_output=True, timeout=300)
 
 
 def make(kind: str, path: Path) -> None:
@@ -228,7 +228,7 @@ def test_standard_output_has_a_second_name(here: Path) -> None:
     assert done.stderr == to_file.stdout.replace(b"out.csv", b"/dev/stdout")
     with (here / "redirected").open("wb") as file:
         command = process("decode run.csv --profile own.csv -o /dev/stdout")
-        subprocess.run(command, stdout=file, stderr=subprocess.DEVNULL, check=True, timeout=120)
+        subprocess.run(command, stdout=file, stderr=subprocess.DEVNULL, check=True, timeout=300)
     assert (here / "redirected").read_bytes() == content
     with pytest.raises(InputError, match="cannot go to standard output"):
         file_to_write(Path("/dev/stdout"))
@@ -251,7 +251,7 @@ def test_options_invalid_on_standard_output_are_refused_in_a_line(
 def test_a_full_standard_output_is_reported_and_a_closed_pipe_is_no_fault(here: Path) -> None:
     command = process("decode run.csv --profile own.csv -o -")
     with open("/dev/full", "wb") as full:
-        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, timeout=120, check=False)
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, timeout=300, check=False)
     assert (done.returncode, done.stderr) == (
         2,
         b"error: standard output: cannot be written: No space left on device\n",
@@ -259,14 +259,14 @@ def test_a_full_standard_output_is_reported_and_a_closed_pipe_is_no_fault(here: 
     begun = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert begun.stdout is not None
     begun.stdout.close()  # as head does
-    _, errors = begun.communicate(timeout=120)
+    _, errors = begun.communicate(timeout=300)
     assert (begun.returncode, errors) == (0, b"")
 
 
 def test_an_output_that_is_redirected_onto_its_input_is_refused(here: Path, made: dict[str, bytes]) -> None:
     with (here / "run.csv").open("ab") as file:
         command = process("decode run.csv --profile own.csv -o -")
-        done = subprocess.run(command, stdout=file, stderr=subprocess.PIPE, timeout=120, check=False)
+        done = subprocess.run(command, stdout=file, stderr=subprocess.PIPE, timeout=300, check=False)
     assert done.returncode == 2
     assert b"-: expected an output apart from its input run.csv" in done.stderr
     assert (here / "run.csv").read_bytes() == made["run.csv"]

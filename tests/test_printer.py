@@ -2,22 +2,12 @@
 
 import os
 import re
-import time
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
+from realtime import until
+
 from imudrv.service.printer import LIMIT, Printer
-
-DEADLINE_S = 60.0
-
-
-def until(true: Callable[[], object], what: str) -> None:
-    """Wait for something that must come; the deadline only ends a broken test."""
-    end = time.monotonic() + DEADLINE_S
-    while not true():
-        assert time.monotonic() < end, f"waited in vain: {what}"
-        time.sleep(0.01)
 
 
 def test_lines_are_printed_complete_and_in_order(tmp_path: Path) -> None:

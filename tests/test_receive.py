@@ -9,15 +9,13 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from realtime import DEADLINE_S, free_port
 
 from imudrv.errors import InputError
 from imudrv.ports.base import PortLostError
 from imudrv.receiver import Receiver, receive
 from imudrv.records import INCREMENTS, Records, Source
 from imudrv.wire.datagram import SIZE, encode
-
-WAIT_S = 20.0
-"""Longest wait for a sample on a busy machine before a test fails."""
 
 
 def increments(count: int, first: int = 0) -> Records:
@@ -47,11 +45,9 @@ class Udp:
     """A receiver and its sender."""
 
     def __init__(self, sender: socket.socket) -> None:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            probe.bind(("127.0.0.1", 0))
-            self.address = probe.getsockname()
+        self.address = "127.0.0.1", free_port()
         self._sender = sender
-        self.receiver = receive(f"udp://:{self.address[1]}", timeout_s=WAIT_S)
+        self.receiver = receive(f"udp://:{self.address[1]}", timeout_s=DEADLINE_S)
 
     def send(self, packet: bytes) -> None:
         self._sender.sendto(packet, self.address)
@@ -138,7 +134,7 @@ def test_tcp_brings_every_sample_in_any_pieces_until_the_other_end_closes() -> N
     with socket.create_server(("127.0.0.1", 0)) as server:
         thread = threading.Thread(target=serve, args=(server,))
         thread.start()
-        with receive(f"tcp://127.0.0.1:{server.getsockname()[1]}", timeout_s=WAIT_S) as receiver:
+        with receive(f"tcp://127.0.0.1:{server.getsockname()[1]}", timeout_s=DEADLINE_S) as receiver:
             got = np.concatenate(list(receiver))
             assert list(receiver) == []
         thread.join()
@@ -150,7 +146,7 @@ def test_a_serial_line_brings_every_sample_until_it_is_unplugged() -> None:
     sent = increments(20)
     unit, line = pty.openpty()
     tty.setraw(line)
-    with receive(f"serial://{os.ttyname(line)}?baudrate=460800", timeout_s=WAIT_S) as receiver:
+    with receive(f"serial://{os.ttyname(line)}?baudrate=460800", timeout_s=DEADLINE_S) as receiver:
         os.close(line)
         os.write(unit, b"noise" + datagrams(sent))
         np.testing.assert_array_equal(take(receiver, 20), sent)

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
+from realtime import DEADLINE_S, free_port, until
 
 from imudrv.calibration import write_calibration
 from imudrv.errors import InputError
@@ -38,7 +39,6 @@ from imudrv.units import ARCSEC
 from imudrv.wire.encode import StreamEncoder
 
 LAYOUT = load("imu50-rs422").layout()
-DEADLINE_S = 60.0
 
 
 def frames(first: int, count: int) -> bytes:
@@ -54,20 +54,6 @@ def frames(first: int, count: int) -> bytes:
 def pulses(counter: ArrayLike) -> NDArray[np.float64]:
     """What each gyro of that unit counts in a sample."""
     return np.rint(100.0 * np.sin(np.asarray(counter) / 50.0))
-
-
-def until(true: Callable[[], object], what: str) -> None:
-    """Wait for something that must come; the deadline only ends a broken test."""
-    end = time.monotonic() + DEADLINE_S
-    while not true():
-        assert time.monotonic() < end, f"waited in vain: {what}"
-        time.sleep(0.02)
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
 
 
 class Unit:
@@ -160,7 +146,7 @@ class Service:
     def command(self, *arguments: str) -> subprocess.CompletedProcess[str]:
         """Run a command that asks this service."""
         command = [sys.executable, "-m", "imudrv", *arguments, "--status", str(self.socket)]
-        return subprocess.run(command, capture_output=True, text=True, timeout=300)
+        return subprocess.run(command, capture_output=True, text=True, timeout=DEADLINE_S)
 
     def stop(self, number: int = signal.SIGTERM) -> int:
         self.process.send_signal(number)
@@ -252,7 +238,7 @@ def test_every_sample_is_sent_in_order_and_equals_that_of_the_offline_command(fo
     assert receiver.lost == 0
 
     command = [sys.executable, "-m", "imudrv", "compensate", "run.mcap", "-o", "offline.npz"]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=DEADLINE_S)
     assert done.returncode == 0, done.stderr
     assert "2000 samples by the counter = 2000 good; 0 duplicate" in done.stdout
     with np.load(folder / "offline.npz") as offline:
@@ -304,25 +290,20 @@ def test_bytes_without_a_frame_are_a_failure_until_frames_resume(folder: Path) -
     unit = Unit(folder / "unit")
     garbage = bytes(range(1, 200))  # no sync in it
     with serving(folder, *serial(folder)) as service:
+        # A busy machine may hold back the data for a moment, which is another state: each one must come.
         with repeating(lambda: unit.send(20)):
             until(lambda: service.good() > 500, "good frames")
-            assert service.command("status").returncode != 4
+            until(lambda: service.command("status").returncode != 4, "health")
         with repeating(lambda: unit.write(garbage)):
-            until(lambda: service.status()["health"] == "fail", "the failure in the status")
-            until(lambda: service.status()["port"]["state"] == "unreadable", "what has failed")
-            answer = service.command("status")
-            assert answer.returncode == 4
-            found = re.match(
-                r"fail\nport unreadable: (\d+) bytes in \d+\.\d s, and no frame of imu50-rs422 in them",
-                answer.stdout,
-            )
-            assert found, answer.stdout
-            assert int(found[1]) >= len(garbage)
-            assert "unreadable" in service.command("monitor").stdout
-            assert any(found[0].removeprefix("fail\n") in line for line in service.warned)
+            said = r"port unreadable: (\d+) bytes in \d+\.\d s, and no frame of imu50-rs422 in them"
+            until(lambda: re.match(f"fail\n{said}", service.command("status").stdout), "what has failed")
+            until(lambda: service.command("status").returncode == 4, "the failure as an exit code")
+            until(lambda: "unreadable" in service.command("monitor").stdout, "the failure on the monitor")
+            until(lambda: re.search(said, "".join(service.warned)), "the event")
+            assert all(int(size) >= len(garbage) for size in re.findall(said, "".join(service.warned)))
         with repeating(lambda: unit.send(20)):
             until(lambda: service.status()["port"]["state"] == "streaming", "the frames read again")
-            assert service.status()["health"] != "fail"
+            until(lambda: service.status()["health"] != "fail", "health again")
         assert service.stop() == 0
 
 
@@ -339,12 +320,18 @@ def test_a_unit_at_another_rate_than_its_profile_is_reported_with_both_rates(fol
     (folder / "slow.yaml").write_text(text.replace("sample_rate_hz: 1000", "sample_rate_hz: 200"))
     with simulated(folder, "slow.yaml"), serving(folder, *serial(folder)) as service:
         until(lambda: service.logged("the unit counts"), "the rate")
-        until(lambda: service.status()["port"]["trouble"], "the rate in the status")
-        status = service.status()
-        assert status["health"] == "warn"
-        assert status["port"]["state"] == "streaming"
-        assert status["reasons"][0].startswith("expected 1000 samples/s of imu50-rs422, the unit counts ")
-        assert any(status["reasons"][0] in line for line in service.warned)
+        words = "expected 1000 samples/s of imu50-rs422, the unit counts "
+        seen: list[dict[str, Any]] = []
+
+        def is_in_the_status() -> bool:
+            seen.append(service.status())
+            return any(words in reason for reason in seen[-1]["reasons"])
+
+        until(is_in_the_status, "the rate in the status")
+        assert seen[-1]["health"] == "warn"
+        assert seen[-1]["port"]["state"] == "streaming"
+        assert seen[-1]["reasons"][0].startswith(words)
+        until(lambda: any(seen[-1]["reasons"][0] in line for line in service.warned), "the event")
         assert service.stop() == 0
 
 
@@ -543,7 +530,7 @@ def test_the_exit_code_differs_when_the_terminal_was_closed(folder: Path) -> Non
 
 def test_a_calibration_of_another_unit_is_refused_at_the_start(folder: Path) -> None:
     command = [sys.executable, "-m", "imudrv", "run", *map(str, serial(folder)), "--unit", "50-0018"]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=DEADLINE_S)
     assert done.returncode == 2
     assert "nominal" in done.stderr
     assert "Traceback" not in done.stderr
@@ -575,10 +562,16 @@ def test_a_tcp_client_that_stops_reading_loses_its_own_samples_only(folder: Path
 def test_an_absent_receiver_has_no_effect(folder: Path) -> None:
     unit = Unit(folder / "unit")
     with serving(folder, *serial(folder), "--out", f"udp://127.0.0.1:{free_port()}") as service:
-        unit.send(500)
-        until(lambda: service.good() == 500, "all samples")
-        until(lambda: service.status()["sinks"][0]["state"] == "nobody listens", "the state")
-        assert service.status()["health"] in ("warn", "fail")
+        seen: list[dict[str, Any]] = []
+
+        def is_reported() -> bool:
+            seen.append(service.status())
+            return seen[-1]["sinks"][0]["state"] == "nobody listens"
+
+        with repeating(lambda: unit.send(20)):  # the network answers what is sent
+            until(is_reported, "the state")
+        assert seen[-1]["health"] in ("warn", "fail")
+        until(lambda: service.good() == unit.counter, "all samples")
         assert service.stop() == 0
 
 
@@ -607,7 +600,7 @@ def test_a_status_for_scripts_and_one_for_people(folder: Path) -> None:
             cwd=folder,
             capture_output=True,
             text=True,
-            timeout=300,
+            timeout=DEADLINE_S,
         )
         assert second.returncode == 2
         assert "expected no other service" in second.stderr
@@ -628,11 +621,12 @@ def test_the_service_manager_is_notified(folder: Path) -> None:
                 assert manager.recv(100) == b"READY=1"
                 assert manager.recv(100) == b"WATCHDOG=1"
                 unit.send(20)
-                assert service.stop() == 0
-            rest = set()
-            while (message := manager.recv(100)) != b"STOPPING=1":
-                rest.add(message)
-            assert rest <= {b"WATCHDOG=1"}
+                service.process.terminate()
+                rest = set()  # read at once: the socket holds few messages
+                while (message := manager.recv(100)) != b"STOPPING=1":
+                    rest.add(message)
+                assert rest <= {b"WATCHDOG=1"}
+                assert service.ended() == 0
         finally:
             del os.environ["NOTIFY_SOCKET"], os.environ["WATCHDOG_USEC"]
 
@@ -644,7 +638,9 @@ def test_a_replay_of_a_capture_gives_what_the_offline_command_gives(folder: Path
         assert service.ended() == 0
         assert service.logged("2999 samples by the counter = 2999 good")
     command = [sys.executable, "-m", "imudrv", "compensate", "run.raw", *map(str, serial(folder)[2:])]
-    subprocess.run([*command, "-o", "offline.i50n"], cwd=folder, check=True, timeout=300, capture_output=True)
+    subprocess.run(
+        [*command, "-o", "offline.i50n"], cwd=folder, check=True, timeout=DEADLINE_S, capture_output=True
+    )
     live, offline = (np.fromfile(folder / f"{n}.i50n", "u1").reshape(-1, 76) for n in ("live", "offline"))
     # All but source, flags and time, which a replay has and a capture has not, and the check over them.
     for part in (slice(8, 16), slice(24, 72)):

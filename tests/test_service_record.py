@@ -6,6 +6,7 @@ from time import sleep
 
 import numpy as np
 import pytest
+from realtime import DEADLINE_S
 
 from imudrv.calibration import coefficients, write_calibration
 from imudrv.errors import InputError
@@ -18,8 +19,6 @@ from imudrv.service.settings import Settings
 from imudrv.sim.scenario import NOMINAL
 from imudrv.sinks.base import Batch, Sink, SinkState
 from imudrv.sinks.history import History
-
-DEADLINE_S = 60.0
 
 
 class Counted(Sink):

@@ -6,6 +6,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from signal import SIGHUP, SIGINT, SIGTERM
 from threading import Thread
 from typing import Final
 
@@ -26,6 +27,7 @@ from imudrv import profiles
 from imudrv.errors import InputError
 from imudrv.files import settings_file
 from imudrv.service.loop import Service
+from imudrv.service.runtime import SignalFlags
 from imudrv.service.settings import Settings
 from imudrv.sinks.history import History
 from imudrv.site import Site
@@ -148,12 +150,14 @@ def conduct(session: Session, options: RunOptions, console: Console) -> int:
         unit=plan.unit,
         status=str(Path(tempfile.gettempdir()) / f"imu50-calib-{os.getpid()}.sock"),
     )
+    signals = SignalFlags()
     service = Service(
         settings,
         lambda text: queue.put_message(text.partition(" ")[2]),
         [queue],
         in_real_time=simulated is None,
         history=History(),
+        signals=signals,
     )
 
     def begin(steps: Procedure) -> None:
@@ -171,17 +175,20 @@ def conduct(session: Session, options: RunOptions, console: Console) -> int:
         begin=begin,
     )
     worker = Thread(target=controller.run, name="controller")
-    worker.start()
-    try:
-        service.run()
-    finally:
-        queue.close()
-        worker.join()
-        if simulated is not None:
-            simulated.end()
-        if not controller.outcome:
-            console.print(f"accepted steps: {', '.join(session.accepted) or 'none'}", markup=False)
-            console.print(f"resume with: calib run --session {session.folder}", markup=False, soft_wrap=True)
+    # From here on: an interrupt while compiled code is loaded could be lost or leave a lock behind.
+    with signals.caught(SIGINT, SIGTERM, SIGHUP):
+        worker.start()
+        try:
+            service.run()
+        finally:
+            queue.close()
+            worker.join()
+            if simulated is not None:
+                simulated.end()
+            if not controller.outcome:
+                console.print(f"accepted steps: {', '.join(session.accepted) or 'none'}", markup=False)
+                resume_command = f"resume with: calib run --session {session.folder}"
+                console.print(resume_command, markup=False, soft_wrap=True)
     if controller.error is not None:
         raise controller.error
     if not controller.outcome:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from realtime import DEADLINE_S
 from rich.console import Console
 
 from calib.bench.entries import Plan, from_json
@@ -50,7 +51,6 @@ poses:
   - {id: y-up, up: +Y, east: +Z, turn_deg: 180}
 """
 STEPS = ["z-up", "x-up", "y-up"]
-DEADLINE_S = 300.0
 RUN = """
 import sys
 from pathlib import Path
@@ -61,14 +61,28 @@ procedure, folder, *redo = sys.argv[1:]
 options = RunOptions(Path(folder), procedure=procedure, rehearse=True, speed="max", redo=tuple(redo))
 sys.exit(guarded(lambda: run(options, Console(width=200))))
 """
+INTERRUPTED_LOADING = f"""
+import os, signal
+from imudrv.service import loop
+load = loop.warm_up
+
+def interrupted(*arguments):
+    try:
+        os.kill(os.getpid(), signal.SIGINT)
+    except KeyboardInterrupt:
+        pass  # as in a callback of the compiler, which can raise nothing
+    load(*arguments)
+
+loop.warm_up = interrupted
+{RUN}"""
 
 
-def start(folder: Path, *redo: str) -> subprocess.Popen[str]:
+def start(folder: Path, *redo: str, program: str = RUN) -> subprocess.Popen[str]:
     """Begin or resume a rehearsal."""
     procedure = folder.parent / "short.yaml"
     procedure.write_text(PROCEDURE)
     return subprocess.Popen(
-        [sys.executable, "-c", RUN, str(procedure), str(folder), *redo],
+        [sys.executable, "-c", program, str(procedure), str(folder), *redo],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -84,7 +98,7 @@ def journal(folder: Path) -> list[dict[str, Any]]:
 
 
 def until(process: subprocess.Popen[str], true: Callable[[], bool]) -> None:
-    """Wait for an outcome; the deadline only ends a broken test."""
+    """Wait for an outcome, or for the end of a process that should run."""
     end = time.monotonic() + DEADLINE_S
     while not true():
         if process.poll() is not None or time.monotonic() > end:
@@ -160,7 +174,7 @@ def test_the_operator_sees_that_the_unit_sends_no_frame_of_the_profile(tmp_path:
         until(operator, lambda: "preflight: NO FRAMES: CHECK THE PROFILE" in shown.read_text())
         assert "and no frame of imu50-rs422 in them" in shown.read_text()
         operator.send_signal(signal.SIGINT)
-        assert operator.wait(DEADLINE_S) == 130
+        assert operator.wait(DEADLINE_S) == 130, shown.read_text()
     finally:
         for process in (unit, operator):
             process.kill()
@@ -349,9 +363,9 @@ def test_a_session_killed_and_stopped_at_random_moments_is_resumed_with_the_same
         process = start(folder)
         until(process, lambda moment=moment: len(journal(folder)) >= moment)  # type: ignore[misc]
         process.send_signal(number)
-        out, _ = process.communicate(timeout=DEADLINE_S)
+        out, err = process.communicate(timeout=DEADLINE_S)
         if number is signal.SIGINT:
-            assert process.returncode == 130
+            assert process.returncode == 130, out + err
             assert f"resume with: calib run --session {folder}" in out
     ended(start(folder))
     check_resumed(folder)
@@ -360,6 +374,13 @@ def test_a_session_killed_and_stopped_at_random_moments_is_resumed_with_the_same
     # sigma of their difference.
     found = size_effect(folder)
     assert (np.abs(found.r_m - size_effect(whole).r_m) < 3.0 * 2.0**0.5 * sigma(found)).all()
+
+
+def test_ctrl_c_is_not_lost_while_compiled_code_is_loaded(tmp_path: Path) -> None:
+    process = start(tmp_path / "session", program=INTERRUPTED_LOADING)
+    out, err = process.communicate(timeout=DEADLINE_S)
+    assert process.returncode == 130, out + err
+    assert f"resume with: calib run --session {tmp_path / 'session'}" in out
 
 
 def sigma(found: SizeEffect) -> np.ndarray:

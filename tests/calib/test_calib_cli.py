@@ -122,7 +122,7 @@ def test_recordings_bring_their_own_profile_and_calibration(
         service = ["run", "--port", f"sim://{name}.yaml?speed=max", "--profile", "imu50-rs422"]
         service += ["--calibration", "unit.yaml", "--record", f"{name}.mcap", "--status", "status.sock"]
         subprocess.run(
-            [sys.executable, "-m", "imudrv", *service], check=True, capture_output=True, timeout=120
+            [sys.executable, "-m", "imudrv", *service], check=True, capture_output=True, timeout=300
         )
     recordings = ["identify", "z.mcap", "x.mcap", "y.mcap", "--site", "site.yaml", "-o", "recorded.yaml"]
     assert main(recordings) == 0
@@ -174,7 +174,7 @@ def test_a_certificate_that_the_data_contradict_is_refused_but_the_report_is_the
 def test_a_reader_who_leaves_early_does_not_cost_the_certificate(here: Path) -> None:
     options = "--profile imu50-rs422 --calibration unit.yaml --site site.yaml -o piped.yaml"
     command = f"{sys.executable} -m calib identify {' '.join(CAPTURES)} {options} | head -n 1"
-    subprocess.run(command, shell=True, cwd=here, check=True, capture_output=True, timeout=120)
+    subprocess.run(command, shell=True, cwd=here, check=True, capture_output=True, timeout=300)
     assert (here / "piped.yaml").exists()
 
 

@@ -4,13 +4,13 @@ import os
 import pty
 import sys
 import termios
-import time
 from collections.abc import Iterator
 from io import StringIO
 from threading import Event
 from typing import Any
 
 import pytest
+from realtime import DEADLINE_S, until
 from rich.console import Console
 
 from calib.bench import block_letters
@@ -20,7 +20,6 @@ from calib.procedure.events import Abort, Confirm, Phase, Redo, Skip, View
 from calib.procedure.messages import english, verbatim
 from imudrv.diagnosis import LineState
 
-DEADLINE_S = 20.0
 LONG = (
     "gravity reads 9.203 m/s^2 where 9.792 +- 0.02 is expected: check the accelerometers' scale factors",
     "the readings are those of a unit whose accelerometers X and Y are exchanged, or of another pose",
@@ -209,10 +208,7 @@ def test_the_bell_rings_when_bells_grow(monkeypatch: pytest.MonkeyPatch) -> None
 
 def written(shown: OperatorScreen) -> None:
     """Wait until a screen has written everything."""
-    end = time.monotonic() + DEADLINE_S
-    while not shown.is_idle:
-        assert time.monotonic() < end
-        time.sleep(0.001)
+    until(lambda: shown.is_idle)
 
 
 class Stopped(StringIO):

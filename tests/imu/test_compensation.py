@@ -199,7 +199,7 @@ def test_without_the_compiler_the_bits_are_the_same():
         env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
         capture_output=True,
         check=False,
-        timeout=120,
+        timeout=300,
     )
     assert run.returncode == 0, run.stderr.decode()
     for pieces, f in zip(pickle.loads(run.stdout), FILTERS.values(), strict=True):

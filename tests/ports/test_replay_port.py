@@ -6,7 +6,7 @@ from mcap.writer import Writer
 
 from imudrv import Source
 from imudrv.errors import InputError
-from imudrv.ports import PortEndedError, PortLostError, open_port
+from imudrv.ports import PortEndedError, PortLostError, open_port, replay
 from imudrv.recording.format import BYTES, CAN_MESSAGES, WIRE, pack_messages
 from imudrv.records import MESSAGE
 from imudrv.wire.candump import format_candump
@@ -155,17 +155,20 @@ def test_a_recording_without_a_read_is_at_its_end(rs422, tmp_path, opened):
         opened(f"replay://{path}", rs422).read(0)
 
 
-def test_no_piece_is_replayed_before_its_time(rs422, tmp_path, opened):
+def test_no_piece_is_replayed_before_its_time(rs422, tmp_path, opened, monkeypatch):
+    clock = [10**18]
+    monkeypatch.setattr(replay, "now_ns", lambda: clock[0])
+    monkeypatch.setattr(time, "sleep", lambda s: clock.append(clock.pop() + round(s * 1e9)))
     capture = tmp_path / "slow.raw"
     capture.write_bytes(bytes(2 * FRAME))
     port = opened(f"replay://{capture}?speed=0.005", rs422)  # a frame each 0.2 s
-    begin = time.monotonic()
     assert len(port.read(0).data) == FRAME
     assert port.read(0).data == b""
-    assert 1 * MS <= port.read(0.001).t_ns < 2 * MS
+    early = port.read(0.04)
+    assert (early.data, early.t_ns) == (b"", 1.2 * MS)
     while not port.read(0.05).data:
         pass
-    assert time.monotonic() - begin >= 0.2  # no upper limit: a machine may be slow
+    assert clock[0] == 10**18 + 200 * MS
 
 
 def test_a_pause_of_a_log_is_kept(can_profile, tmp_path, opened):

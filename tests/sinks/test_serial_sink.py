@@ -59,7 +59,7 @@ def test_a_stuck_line_delays_nothing_else_and_loses_its_oldest_samples(batch, wa
         sink.publish(batch(first, 4))
     state = sink.state
     assert state.dropped > 0
-    assert LIMIT <= state.queued <= LIMIT + 1
+    assert state.queued <= LIMIT + 1
     assert state.sent + state.dropped + state.queued == samples
     got = bytearray()
     wait_for(lambda: sink.poll() or got.extend(line.read()) or len(got) == (samples - state.dropped) * SIZE)
@@ -85,7 +85,9 @@ def test_an_absent_or_unplugged_port_is_opened_once_it_exists(
         name.symlink_to(line.path)
         wait_for(lambda: sink.poll() or sink.state.state == "ok")
         sink.publish(batch(10 * round_, 1))
-        assert counters(line.read()) == [10 * round_]
+        got = bytearray()
+        wait_for(lambda line=line, got=got: got.extend(line.read()) or len(got) == SIZE)
+        assert counters(bytes(got)) == [10 * round_]
         name.unlink()
         line.close()
         wait_for(lambda: sink.publish(batch(7, 1)) or not sink.state.healthy)

@@ -50,7 +50,9 @@ def check_candump(_: Setup, data: bytes, cuts: Cuts) -> None:
     assert lines == sum(channels[0].values()) + len(rejects), f"{lines} lines, messages {channels[0]}"
     assert len(messages) == next(iter(channels[0].values()), 0), f"{len(messages)} messages of {channels[0]}"
     assert np.all(messages["length"] <= np.where(messages["fd"], 64, 8)), "more data than a frame holds"
-    assert np.all(messages["id"] < 2**29), "identifier of more than 29 bits"
+    identifiers = messages["id"]
+    limits = np.where(identifiers & EXTENDED, 2**29, 2**11)
+    assert np.all(identifiers & ~np.uint32(EXTENDED) < limits), "identifier of more than 29 bits"
     again, _ = decode([format_candump(messages)])
     again["t_ns"] += messages["t_ns"] % 1000  # a log has microseconds
     assert np.array_equal(again, messages)

@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
-TIMEOUT_S: Final = 60.0
+TIMEOUT_S: Final = 300.0
 """Generous: it only ends a test that hangs."""
 
 

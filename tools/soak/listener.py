@@ -17,5 +17,6 @@ if __name__ == "__main__":
         print("listening", flush=True)
         while not stop.is_set():
             received.extend(receiver)
+        received.extend(receiver)  # what came in the last moment
     np.save(sys.argv[2], np.concatenate(received))
     print(f"lost {receiver.lost}, {receiver.rejected_bytes} bytes rejected")
