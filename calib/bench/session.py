@@ -37,6 +37,7 @@ from calib.procedure.schema import VERIFICATION
 from imudrv import profiles
 from imudrv.calibration import Calibration, read_calibration, read_calibration_file, write_calibration
 from imudrv.errors import InputError
+from imudrv.files.atomic import sync_folder
 
 
 class Session(SessionState):
@@ -179,7 +180,7 @@ class Session(SessionState):
                 os.fsync(file.fileno())
                 digest = hashlib.file_digest(file, "sha256").hexdigest()
                 size = file.tell()
-            _sync_folder(self.folder)
+            sync_folder(self.folder)
         except OSError as error:
             raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
         self.append(FileRecorded(name, size, digest, left))
@@ -238,11 +239,3 @@ def _locked(folder: Path) -> int:
         os.close(lock)
         raise InputError(f"{folder}: another process has this session open; end it first") from None
     return lock
-
-
-def _sync_folder(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

@@ -1,6 +1,7 @@
 """Folder of a session: nothing in it can be lost, doubled or changed undetected."""
 
 import json
+import os
 from collections.abc import Callable, Iterator
 from hashlib import sha256
 from io import StringIO
@@ -130,6 +131,15 @@ def line_of(data: bytes, at: int) -> int:
 
 
 # Hash chain
+
+
+def test_a_new_journal_and_its_name_are_on_the_disk(
+    session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synchronised = []
+    monkeypatch.setattr(os, "fsync", lambda fd: synchronised.append(Path(f"/proc/self/fd/{fd}").resolve()))
+    journals.begin(tmp_path / JOURNAL, session.plan)
+    assert synchronised == [tmp_path / JOURNAL, tmp_path]
 
 
 def test_each_line_is_json_with_the_hash_of_its_text_and_of_the_line_before(folder: Path) -> None:
