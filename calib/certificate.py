@@ -83,15 +83,12 @@ def with_lever_arms(
     if key == PROVENANCE_IDENTIFIED:
         provenance.pop(PROVENANCE_CONVERTED, None)
     provenance[key] = {"software": software(), **how}
-    covariance = None if arms.covariance is None else arms.covariance / MM**2
-    rows = np.round(arms.r_b / MM, _R_DECIMALS) + 0.0  # no -0
-    size_effect = SizeEffect(
-        r_mm=SensingPoints(**{axis: _row(r) for axis, r in zip("xyz", rows, strict=True)}),
-        gauge=arms.gauge,
-        covariance_mm2=None
-        if covariance is None
-        else tuple(_row(r) for r in np.round(covariance, _COVARIANCE_DECIMALS) + 0.0),
-    )
+    covariance: Any = None
+    if arms.covariance is not None:
+        rounded = np.round(arms.covariance / MM**2, _COVARIANCE_DECIMALS) + 0.0  # no -0
+        covariance = tuple(map(tuple, rounded.tolist()))
+    r_mm = np.round(arms.r_b / MM, _R_DECIMALS) + 0.0
+    size_effect = SizeEffect(r_mm=sensing_points(r_mm), gauge=arms.gauge, covariance_mm2=covariance)
     return calibration.model_copy(
         update={
             "created": when or datetime.now(UTC).replace(microsecond=0),
@@ -173,6 +170,7 @@ def write(path: Path, calibration: Calibration) -> None:
     write_calibration(path, calibration)
 
 
-def _row(values: Array) -> Any:
-    """Return a row as the file models take it."""
-    return tuple(values.tolist())
+def sensing_points(r_mm: Array) -> SensingPoints:
+    """Return sensing points, rows of a matrix in mm, as the calibration file has them."""
+    x, y, z = map(tuple, r_mm.tolist())
+    return SensingPoints(x=x, y=y, z=z)

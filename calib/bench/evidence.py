@@ -5,8 +5,6 @@ attempt.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
-from datetime import UTC, datetime
 from itertools import islice
 from typing import Final, NamedTuple
 
@@ -18,32 +16,24 @@ from calib.bench.state import Attempt, SessionState
 from calib.certificate import certificate
 from calib.detection.blocks import BLOCK_NS
 from calib.estimation.joint import estimate_joint
-from calib.estimation.runs import CaptureRuns, NavigationOptions, Priors, Run, navigate_rotations
+from calib.estimation.linear_system import velocity_gain
+from calib.estimation.runs import CaptureRuns, NavigationOptions, Priors, navigate_capture
 from calib.identification import (
     CaptureSummary,
     IdentificationResult,
     PriorCalibration,
-    Temperature,
-    software,
+    temperature_ranges,
 )
 from calib.procedure.schema import VERIFICATION, Procedure
-from imudrv.calibration import Calibration, coefficients
+from imudrv.calibration import Calibration
 from imudrv.errors import InputError
 from imudrv.files import atomic
-from imudrv.imu.coefficients import Coefficients
-from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import rate_filter
 from imudrv.imu.sequence import SampleCounts, SequenceTracker
 from imudrv.recording.reader import Recording
 from imudrv.records import Records
 from imudrv.site import Site
-from imudrv.units import NS
 from imudrv.wire.decoder import FrameDecoder
 from imudrv.wire.layout import Layout
-
-RESIDUAL_WINDOW_S: Final = 0.5
-"""Averaging window for the velocity before and after a rotation, s."""
-
 
 _PUBLISHED_PERIOD: Final = 1 << 32
 """Period of the counter of published increments."""
@@ -122,19 +112,11 @@ def identify(
     InputError
         A recording cannot be read or lacks its rotation, or `estimate_joint` refuses.
     """
-    priors = Priors()
-    known = replace(coefficients(basis.calibration), r_b=None)
-    sources = tuple(_summarise(procedure, attempt, known, site, priors) for attempt in attempts)
-    findings = IdentificationResult(
-        estimate_joint([run for source in sources for run in source.evidence.runs], priors),
-        basis,
-        site,
-        procedure.rotation_limits(procedure.steps[0]),
-        priors,
-        sources,
-        datetime.now(UTC).replace(microsecond=0),
-        software(),
-    )
+    priors, bare = Priors(), basis.calibration.without_size_effect()
+    sources = tuple(_summarise(procedure, attempt, bare, site) for attempt in attempts)
+    result = estimate_joint([run for source in sources for run in source.evidence.runs], priors)
+    limits = procedure.rotation_limits(procedure.steps[0])
+    findings = IdentificationResult(result, basis, site, limits, priors, sources)
     return Result(findings, certificate(findings, findings.arms))
 
 
@@ -200,40 +182,30 @@ def residual_velocity(
     InputError
         The recording cannot be read or lacks its rotation.
     """
-    known, decoded = coefficients(calibration), _decode_covered(attempt)
-    rows = round(RESIDUAL_WINDOW_S / (BLOCK_NS * NS))
+    decoded = _decode_covered(attempt)
     residual = []
-    for c in (replace(known, r_b=None), known):
-        run = _navigate(procedure, attempt, decoded, c, site, Priors()).runs[0]
-        gained = _mean(run, run.after, slice(rows)) - _mean(run, run.before, slice(-rows, None))
-        residual.append(float(np.hypot(gained[0], gained[1])))
+    for used in (calibration.without_size_effect(), calibration):
+        run = _navigate(procedure, attempt, decoded, used, site).runs[0]
+        V, _ = velocity_gain(run)
+        residual.append(float(np.hypot(V[0], V[1])))
     return ResidualVelocity(*residual)
 
 
-def _mean(run: Run, rest: np.ndarray, rows: slice) -> np.ndarray:
-    mean: np.ndarray = run.v_n[rest][rows].mean(axis=0)
-    return mean
-
-
 def _summarise(
-    procedure: Procedure, attempt: Attempt, known: Coefficients, site: Site, priors: Priors
+    procedure: Procedure, attempt: Attempt, calibration: Calibration, site: Site
 ) -> CaptureSummary:
     with atomic.unchanged(attempt.recording):
         decoded = _decode_covered(attempt)
         digest = atomic.sha256(attempt.recording)
-    degc = decoded.pulses["temperature_degc"]
+    layout, degc = decoded.layout, decoded.pulses["temperature_degc"]
     return CaptureSummary(
         attempt.recording.stem,
         attempt.recording.name,
         digest,
-        decoded.layout.name,
+        layout.name,
         str(decoded.counts),
-        tuple(
-            Temperature(name, float(t.min()), float(t.max()))
-            for name, column in zip(decoded.layout.temperature_names, degc.T, strict=False)
-            if (t := column[~np.isnan(column)]).size
-        ),
-        _navigate(procedure, attempt, decoded, known, site, priors),
+        temperature_ranges(layout.temperature_names, np.fmin.reduce(degc), np.fmax.reduce(degc)),
+        _navigate(procedure, attempt, decoded, calibration, site),
     )
 
 
@@ -241,19 +213,17 @@ def _navigate(
     procedure: Procedure,
     attempt: Attempt,
     decoded: _DecodedRecording,
-    known: Coefficients,
+    calibration: Calibration,
     site: Site,
-    priors: Priors,
 ) -> CaptureRuns:
-    layout = decoded.layout
-    compensator = Compensator(known, layout, rate_filter("causal", layout.interval_ns))
-    increments = [compensator.feed(decoded.pulses), compensator.close()]
-    evidence = navigate_rotations(
-        lambda: increments,
-        known.C_ba,
+    limits = procedure.rotation_limits(attempt.step)
+    evidence = navigate_capture(
+        lambda: [decoded.pulses],
+        decoded.layout,
+        calibration,
         site,
         attempt.recording.stem,
-        NavigationOptions(procedure.rotation_limits(attempt.step), priors, expected=attempt.step.up[1]),
+        NavigationOptions(limits, expected=attempt.step.up[1]),
     )
     if len(evidence.runs) != 1:
         reasons = "; ".join(reason for _, reasons in evidence.rejected for reason in reasons) or "no motion"

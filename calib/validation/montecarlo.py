@@ -15,23 +15,18 @@ from typing import Any, Final
 import numpy as np
 from scipy.stats import chi2
 
-from calib.certificate import lever_arms_of
+from calib.certificate import lever_arms_of, sensing_points
 from calib.estimation.joint import estimate_joint
 from calib.estimation.plain import estimate_plain
 from calib.estimation.result import TO_DIFFERENCES, LeverArmEstimate
-from calib.estimation.runs import NavigationOptions, Priors, Run, navigate_rotations
-from imudrv import profiles
+from calib.estimation.runs import NavigationOptions, Priors, Run, navigate_capture
+from calib.validation.simulate import LAYOUT, simulated_pulses, true_calibration
 from imudrv.arrays import Array
-from imudrv.calibration import Calibration, coefficients
+from imudrv.calibration import Calibration, SizeEffect
 from imudrv.files.settings_file import parse
-from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import rate_filter
-from imudrv.records import Flag, Records
 from imudrv.sim.scenario import NOMINAL, Residuals, Scenario, Unit
-from imudrv.sim.unit import draw_true_unit, simulate
-from imudrv.units import ARCSEC, DEG, DEG_PER_H, MM, UG, URAD
+from imudrv.units import DEG, MM, UG, URAD
 
-LAYOUT: Final = profiles.load("imu50-rs422").layout()
 REST_S: Final = 60.0
 """Rest before a rotation, s."""
 
@@ -103,21 +98,10 @@ def true_unit(seed: int, budget: Budget) -> Calibration:
         accelerometer_scale_ppm=20.0,
         accelerometer_misalignment_urad=budget.misalignment_urad,
     )
-    nominal = scenario(seed, NOMINAL, "z_up", 1, budget)
-    real = draw_true_unit(nominal.model_copy(update={"unit": Unit(residuals=residuals)}))
-    document = json.loads(NOMINAL.model_dump_json(exclude_none=True))
-    document["gyro"] = {
-        "scale_arcsec_per_pulse": (real.gyro_scale / ARCSEC).tolist(),
-        "bias_deg_per_h": (real.gyro_bias / DEG_PER_H).tolist(),
-        "C_bg": real.C_bg.tolist(),
-    }
-    document["accelerometer"] = {
-        "scale_pulse_per_m_s": real.accelerometer_scale.tolist(),
-        "bias_ug": (real.accelerometer_bias / UG).tolist(),
-        "C_ba": real.C_ba.tolist(),
-    }
-    document["size_effect"] = {"r_mm": dict(zip("xyz", arms.tolist(), strict=True)), "gauge": "centroid"}
-    return parse(document, Calibration, "unit")
+    drawn_from = scenario(seed, NOMINAL, "z_up", 1, budget)
+    real = true_calibration(Unit(residuals=residuals), drawn_from.seed)
+    effect = SizeEffect(r_mm=sensing_points(arms), gauge="centroid")
+    return real.model_copy(update={"size_effect": effect})
 
 
 def scenario(seed: int, calibration: Calibration, pose: str, sign: int, budget: Budget) -> Scenario:
@@ -147,15 +131,6 @@ def scenario(seed: int, calibration: Calibration, pose: str, sign: int, budget: 
     return parse(document, Scenario, "montecarlo")
 
 
-def increments(turn: Scenario) -> Records:
-    """Return the increments of the nominal calibration, without size-effect compensation."""
-    bare = coefficients(NOMINAL.without_size_effect())
-    compensator = Compensator(bare, LAYOUT, rate_filter("causal", LAYOUT.interval_ns))
-    pulses = np.concatenate([chunk.pulses for chunk in simulate(turn, LAYOUT.interval_ns)])
-    pulses["flags"] = Flag.VALID
-    return compensator.feed(pulses)
-
-
 def case(seed: int, signs: tuple[int, ...], budget: Budget) -> tuple[list[Run], Array]:
     """Return the runs of a unit and its true arms, (3, 3) m, with the centroid as origin."""
     real = true_unit(seed, budget)
@@ -163,9 +138,10 @@ def case(seed: int, signs: tuple[int, ...], budget: Budget) -> tuple[list[Run], 
     for sign in signs:
         for pose in POSES:
             turn = scenario(seed, real, pose, sign, budget)
-            found = navigate_rotations(
-                partial(iter, [increments(turn)]),
-                np.eye(3),
+            found = navigate_capture(
+                partial(iter, [np.concatenate(list(simulated_pulses(turn)))]),
+                LAYOUT,
+                NOMINAL.without_size_effect(),
                 turn.site,
                 f"{pose}{sign:+d}",
                 NavigationOptions(priors=budget.priors),
