@@ -30,12 +30,12 @@ _COVARIANCE_DECIMALS: Final = 9
 """Decimals of their covariance, mm^2."""
 
 
-def certificate(findings: IdentificationResult, arms: LeverArms) -> Calibration:
+def certificate(identification: IdentificationResult, arms: LeverArms) -> Calibration:
     """Return the new certificate of the unit: its calibration with the lever arms and their provenance.
 
     Parameters
     ----------
-    findings : IdentificationResult
+    identification : IdentificationResult
         The result.
     arms : LeverArms
         The lever arms in the desired gauge.
@@ -50,11 +50,17 @@ def certificate(findings: IdentificationResult, arms: LeverArms) -> Calibration:
     InputError
         The result does not allow a certificate, see `LeverArmEstimate.refusals`.
     """
-    result = findings.result
+    result = identification.result
     if result.refusals:
         raise InputError(f"no certificate: {'; '.join(result.refusals)}")
-    found = {"method": result.method, **inputs_document(findings), **outcome_document(result)}
-    return with_lever_arms(findings.basis.calibration, arms, PROVENANCE_IDENTIFIED, found, findings.created)
+    found = {"method": result.method, **inputs_document(identification), **outcome_document(result)}
+    return with_lever_arms(
+        identification.prior_calibration.calibration,
+        arms,
+        PROVENANCE_IDENTIFIED,
+        found,
+        identification.created,
+    )
 
 
 def with_lever_arms(

@@ -124,7 +124,7 @@ class CaptureSummary:
         Sample counts and losses, in one line.
     temperatures : tuple of Temperature
         Range of each channel that the unit reported.
-    evidence : CaptureRuns
+    rotations : CaptureRuns
         Rests, rotations, runs.
     channel : str or None
         CAN channel that was read from a candump log.
@@ -136,7 +136,7 @@ class CaptureSummary:
     profile: str
     counts: str
     temperatures: tuple[Temperature, ...]
-    evidence: CaptureRuns
+    rotations: CaptureRuns
     channel: str | None = None
 
 
@@ -148,7 +148,7 @@ class IdentificationResult:
     ----------
     result : LeverArmEstimate
         The estimate.
-    basis : PriorCalibration
+    prior_calibration : PriorCalibration
         The calibration that it extends.
     site : Site
         Place of the unit.
@@ -165,7 +165,7 @@ class IdentificationResult:
     """
 
     result: LeverArmEstimate
-    basis: PriorCalibration
+    prior_calibration: PriorCalibration
     site: Site
     limits: RotationLimits
     priors: Priors
@@ -184,7 +184,7 @@ class IdentificationResult:
         result, n = self.result, len(self.result.runs)
         verdict = "; ".join(result.refusals) or "usable for a certificate"
         return (
-            f"unit {self.basis.calibration.serial_number}, method {result.method}, "
+            f"unit {self.prior_calibration.calibration.serial_number}, method {result.method}, "
             f"{n} rotation{'s' if n > 1 else ''}, rank {result.rank}, sigma of the differences up to "
             f"{result.differences_sigma.max() / MM:.3f} mm: {verdict}"
         )
@@ -205,7 +205,7 @@ class IdentificationResult:
     @property
     def runs(self) -> tuple[Run, ...]:
         """The runs, in the order of `result.runs`."""
-        return tuple(run for source in self.sources for run in source.evidence.runs)
+        return tuple(run for source in self.sources for run in source.rotations.runs)
 
 
 def scatter(run: RunResult) -> float:
@@ -276,7 +276,7 @@ def identify(
             if other.sha256 == source.sha256:
                 raise InputError(f"{path}: expected another capture, got that of {other.name} once more")
         sources.append(source)
-    runs = [run for source in sources for run in source.evidence.runs]
+    runs = [run for source in sources for run in source.rotations.runs]
     if not runs:
         raise InputError(
             "\n  ".join(["expected at least one usable rotation, got none:", *_rejections(sources)])
@@ -382,25 +382,25 @@ def _read(
     try:
         with unchanged(path):  # two passes, and one for the hash
             capture = Capture(path, profile, channel)
-            evidence = navigate_capture(pulses, capture.layout, calibration, site, label)
+            rotations = navigate_capture(pulses, capture.layout, calibration, site, label)
             digest = sha256(path)
     except InputError as error:
         raise error if str(path) in str(error) else InputError(f"{path}: {error}") from None
     layout = capture.layout
     temperatures = temperature_ranges(layout.temperature_names, low, high)
     counts = str(capture.tracker.counts)
-    return CaptureSummary(label, path.name, digest, layout.name, counts, temperatures, evidence, channel)
+    return CaptureSummary(label, path.name, digest, layout.name, counts, temperatures, rotations, channel)
 
 
 def _rejections(sources: Sequence[CaptureSummary]) -> list[str]:
     """Return why each motion was rejected, one line each; one line for a capture without motion."""
     lines = []
     for source in sources:
-        if not source.evidence.segments.rotations:
-            seconds = source.evidence.segments.duration_s
+        if not source.rotations.segments.rotations:
+            seconds = source.rotations.segments.duration_s
             lines.append(f"{source.name}: {seconds:.1f} s at rest, no motion at all")
         lines += [
             f"{source.name}: motion at {rotation.start_s:.1f}..{rotation.stop_s:.1f} s: {'; '.join(reasons)}"
-            for rotation, reasons in source.evidence.rejected
+            for rotation, reasons in source.rotations.rejected
         ]
     return lines

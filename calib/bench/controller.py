@@ -4,12 +4,12 @@ The service reads the unit in the main thread, as in production. One of its sink
 which `SessionController` takes samples: it feeds the engine, journals its events, begins and ends recordings,
 shows the view and reads keys. Engine and session do not know each other.
 
-The worker may be late, by seconds on a loaded machine or a slow disk; the evidence is complete all the same:
+The worker may be late, by seconds on a loaded machine or a slow disk; nothing of a recording is lost then:
 
 - A recording begins at the sample at which the engine asked to place the unit, however late the worker
   handles that event: the service keeps the last minutes of wire data (`imudrv.sinks.history`).
 - A step is accepted, shown as good and journaled only after its recording has been closed, decoded and found
-  to contain every sample of the evidence. Otherwise the step is rejected with that reason and repeated.
+  to contain every sample of the attempt. Otherwise the step is rejected with that reason and repeated.
 - The worker never waits for the terminal: an `OperatorScreen` writes in a thread of its own.
 
 The stages of a session are the steps, the result, the decision and the verification. Each is journaled, so
@@ -33,10 +33,10 @@ from calib.bench.completion import (
     write_report,
 )
 from calib.bench.entries import Counted, Decision, ServiceMessage, SessionEnded, UnitDetected
-from calib.bench.evidence import Result
 from calib.bench.keys import Keyboard
 from calib.bench.queue_sink import QueueReader, QueueSink, ServiceEndedError
 from calib.bench.recordings import AttemptRecordings
+from calib.bench.result import Result
 from calib.bench.resume import require_temperature
 from calib.bench.screen import OperatorScreen, with_port_state
 from calib.bench.session import Session
@@ -175,7 +175,7 @@ class SessionController:
         return decision.accepted
 
     def _run_steps(self, procedure: Procedure) -> Finished | Aborted:
-        """Conduct the steps that are not accepted yet; on return all evidence is filed."""
+        """Conduct the steps that are not accepted yet; on return all recordings are filed."""
         session = self._session
         ids = {step.id for step in procedure.steps}
         accepted = {name: step for name, step in session.accepted.items() if name in ids}

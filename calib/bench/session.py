@@ -1,4 +1,4 @@
-"""Folder of a session: plan, journal and evidence; safe against a kill or power cut.
+"""Folder of a session: plan, journal and recordings; safe against a kill or power cut.
 
 ====================  ===================================================================================
 ``journal.jsonl``     see `calib.bench.journal`; its first line is the plan
@@ -9,7 +9,7 @@
 ====================  ===================================================================================
 
 The SHA-256 of each file is written to the journal once the file is closed. A step is accepted only when its
-files are recorded there and its recording has been decoded and found to cover the evidence of the step. The
+files are recorded there and its recording has been decoded and found to cover the attempt. The
 result can therefore always be computed again from the files.
 """
 

@@ -67,10 +67,6 @@ class RunResult:
     ----------
     label : str
         Label of the run.
-    axis : str
-        Body axis that was up, '+X' to '-Z'.
-    angle_deg : float
-        Angle, right-handed about up.
     V_n : ndarray, shape (3,)
         Velocity gain of the rotation: mean over half a second after it minus that before it, east, north,
         up, m/s.
@@ -88,8 +84,6 @@ class RunResult:
     """
 
     label: str
-    axis: str
-    angle_deg: float
     V_n: Array
     H: Array
     compensated_n: Array

@@ -136,7 +136,7 @@ class Engine:
         return self._new_events()
 
     def reject(self, step_id: str, reason: str) -> tuple[Event, ...]:
-        """Withdraw an accepted step, because its evidence could not be stored; it has to be done again.
+        """Withdraw an accepted step, because its recording is not complete; it has to be done again.
 
         Parameters
         ----------

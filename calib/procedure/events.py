@@ -59,7 +59,7 @@ class Confirm:
 
 @dataclass(frozen=True)
 class Redo:
-    """Repeat a step, the current one or one that was accepted or skipped; evidence is kept."""
+    """Repeat a step, the current one or one that was accepted or skipped; all recordings are kept."""
 
     step_id: str
 
@@ -128,7 +128,7 @@ class Accepted:
     Attributes
     ----------
     first_counter, last_counter : int
-        First and last sample of the evidence: rest before, rotation, rest after, and nothing else.
+        First and last sample of the attempt: rest before, rotation, rest after, and nothing else.
     angle_deg, duration_s, peak_deg_per_s, axis_tilt_deg : float
         The rotation, as detected in these samples.
     rest_before_s, rest_after_s : float
@@ -140,7 +140,7 @@ class Accepted:
     v_n : tuple of 3 float
         Mean velocity east, north, up in the half second after the turn, m/s.
     samples : int or None
-        Number of samples of the evidence, fewer than the counters span where some were lost; None in the
+        Number of samples of the attempt, fewer than the counters span where some were lost; None in the
         journal of an older version.
     """
 
@@ -165,7 +165,7 @@ class Accepted:
 class Rejected:
     """An attempt, or the preflight (`step_id` is `PREFLIGHT`), is rejected.
 
-    It follows `Accepted` of the same attempt where the evidence could not be stored.
+    It follows `Accepted` of the same attempt where the recording is not complete.
     """
 
     step_id: str

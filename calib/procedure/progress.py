@@ -127,7 +127,7 @@ class Progress:
         return Outcome.DISTURBED
 
     def reject(self, *reasons: Message) -> Outcome:
-        """Report that the attempt is rejected, and drop its evidence."""
+        """Report that the attempt is rejected, and drop its samples."""
         self.events.append(Rejected(self.step.id, self.number, reasons, self.counter))
         self.bells += 1
         self.reasons = reasons

@@ -18,8 +18,8 @@ import pytest
 from rich.console import Console
 
 from calib.bench.entries import Plan, from_json
-from calib.bench.evidence import identify, identify_session
 from calib.bench.journal import Journal, begin
+from calib.bench.result import identify, identify_session
 from calib.bench.run import RunOptions, run
 from calib.bench.session import Session
 from calib.bench.simulated_unit import SEED
@@ -378,7 +378,7 @@ def check_true(folder: Path) -> None:
 
 
 def check_resumed(folder: Path) -> None:
-    """No accepted step was repeated, no sample logged twice, all evidence is complete."""
+    """No accepted step was repeated, no sample logged twice, all recordings are complete."""
     done: list[str] = []
     logged: set[str] = set()
     for entry in journal(folder):

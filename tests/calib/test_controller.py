@@ -25,9 +25,9 @@ from calib.bench.entries import (
     UnitDetected,
     to_json,
 )
-from calib.bench.evidence import Result
 from calib.bench.keys import Keyboard
 from calib.bench.queue_sink import QueueSink
+from calib.bench.result import Result
 from calib.bench.screen import OperatorScreen, plain
 from calib.bench.session import Session
 from calib.bench.technician import BENCH, Mistake, technician_scenario

@@ -190,8 +190,8 @@ def test_the_verdict_is_that_of_the_segments_of_the_samples_that_it_names(
     (accepted,) = driver.of(Accepted)
     counter = turned["counter"]
 
-    evidence = turned[(counter >= accepted.first_counter) & (counter <= accepted.last_counter)]
-    (rotation,) = find_segments([evidence]).rotations
+    attempt = turned[(counter >= accepted.first_counter) & (counter <= accepted.last_counter)]
+    (rotation,) = find_segments([attempt]).rotations
 
     assert rotation.angle_deg == pytest.approx(accepted.angle_deg, abs=1e-9)  # rounding of sums in pieces
     assert rotation.peak_deg_per_s == pytest.approx(accepted.peak_deg_per_s, abs=1e-9)

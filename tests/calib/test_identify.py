@@ -115,7 +115,7 @@ def test_compensation_takes_nearly_all_of_the_velocity(captured: tuple[list[Run]
         # the fitted velocity agrees within noise, a random walk over 25 s
         assert np.abs(run.v_n - run.fitted_n).max() < 1e-3
         assert len(run.t_s) == len(run.v_n) == len(run.fitted_n)
-    assert [run.axis for run in estimate_joint(captured[0]).runs] == ["+Z", "+X", "+Y"]
+    assert [run.rotation.axis for run in captured[0]] == ["+Z", "+X", "+Y"]
 
 
 # --- what the rotations see ---

@@ -90,7 +90,7 @@ def accepted_step(step_id: str, recording: str, degc: dict[str, float], **more: 
 
 @pytest.fixture
 def accept(recorded: Callable[..., Path]) -> Accept:
-    """Accept an attempt with its files; the recording begins at `since`, the evidence at 1000."""
+    """Accept an attempt with its files; the recording begins at `since`, the attempt at 1000."""
 
     def accept(
         session: Session, step_id: str, degc: dict[str, float] = DEGC, since: int = 900, **more: object

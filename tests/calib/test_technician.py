@@ -58,16 +58,16 @@ class Performance:
             accepted = self.engine.accepted[step.id]
             counter = self.samples["counter"]
             inside = (counter >= accepted.first_counter) & (counter <= accepted.last_counter)
-            evidence = navigate_rotations(
+            navigated = navigate_rotations(
                 lambda inside=inside: [self.samples[inside]],
                 calibration.accelerometer.C_ba_array,
                 self.scenario.site,
                 step.id,
                 NavigationOptions(self.procedure.rotation_limits(step), expected=step.up[1]),
             )
-            assert len(evidence.runs) == 1
-            assert not evidence.rejected
-            runs += evidence.runs
+            assert len(navigated.runs) == 1
+            assert not navigated.rejected
+            runs += navigated.runs
         return estimate_joint(runs)
 
 

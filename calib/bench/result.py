@@ -48,23 +48,23 @@ class Result(NamedTuple):
 
     Attributes
     ----------
-    findings : IdentificationResult
+    identification : IdentificationResult
         The identification.
     certificate : Calibration
         The unit's new certificate.
     """
 
-    findings: IdentificationResult
+    identification: IdentificationResult
     certificate: Calibration
 
 
 class _DecodedRecording(NamedTuple):
-    """Decoded evidence of an attempt.
+    """Decoded samples of an attempt.
 
     Attributes
     ----------
     pulses : Records
-        Samples of the evidence.
+        Pulses.
     counter : ndarray of int64
         Their counters, in the service's count.
     layout : Layout
@@ -88,7 +88,7 @@ def identify_session(session: SessionState) -> Result:
 
 
 def identify(
-    procedure: Procedure, attempts: Sequence[Attempt], basis: PriorCalibration, site: Site
+    procedure: Procedure, attempts: Sequence[Attempt], prior_calibration: PriorCalibration, site: Site
 ) -> Result:
     """Identify the lever arms.
 
@@ -98,7 +98,7 @@ def identify(
         The procedure that was carried out.
     attempts : sequence of Attempt
         The accepted attempts.
-    basis : PriorCalibration
+    prior_calibration : PriorCalibration
         The certificate before; its size effect is not used.
     site : Site
         Site of the bench.
@@ -112,12 +112,12 @@ def identify(
     InputError
         A recording cannot be read or lacks its rotation, or `estimate_joint` refuses.
     """
-    priors, bare = Priors(), basis.calibration.without_size_effect()
+    priors, bare = Priors(), prior_calibration.calibration.without_size_effect()
     sources = tuple(_summarise(procedure, attempt, bare, site) for attempt in attempts)
-    result = estimate_joint([run for source in sources for run in source.evidence.runs], priors)
+    result = estimate_joint([run for source in sources for run in source.rotations.runs], priors)
     limits = procedure.rotation_limits(procedure.steps[0])
-    findings = IdentificationResult(result, basis, site, limits, priors, sources)
-    return Result(findings, certificate(findings, findings.arms))
+    identification = IdentificationResult(result, prior_calibration, site, limits, priors, sources)
+    return Result(identification, certificate(identification, identification.arms))
 
 
 def uncovered(attempt: Attempt) -> str:
@@ -217,7 +217,7 @@ def _navigate(
     site: Site,
 ) -> CaptureRuns:
     limits = procedure.rotation_limits(attempt.step)
-    evidence = navigate_capture(
+    navigated = navigate_capture(
         lambda: [decoded.pulses],
         decoded.layout,
         calibration,
@@ -225,17 +225,17 @@ def _navigate(
         attempt.recording.stem,
         NavigationOptions(limits, expected=attempt.step.up[1]),
     )
-    if len(evidence.runs) != 1:
-        reasons = "; ".join(reason for _, reasons in evidence.rejected for reason in reasons) or "no motion"
+    if len(navigated.runs) != 1:
+        reasons = "; ".join(reason for _, reasons in navigated.rejected for reason in reasons) or "no motion"
         raise InputError(
-            f"{attempt.recording}: expected the one rotation that was accepted, got {len(evidence.runs)}: "
+            f"{attempt.recording}: expected the one rotation that was accepted, got {len(navigated.runs)}: "
             f"{reasons}"
         )
-    return evidence
+    return navigated
 
 
 def _decode_covered(attempt: Attempt) -> _DecodedRecording:
-    """Decode a recording and cut it to the evidence, which must be complete."""
+    """Decode a recording and cut it to the samples of the attempt, which must be complete."""
     decoded = _decode(attempt)
     if lacks := _missing(attempt, decoded):
         step, folder = attempt.step.id, attempt.recording.parent
@@ -247,7 +247,7 @@ def _decode_covered(attempt: Attempt) -> _DecodedRecording:
 
 
 def _decode(attempt: Attempt) -> _DecodedRecording:
-    """Decode a recording and cut it to the evidence that it contains."""
+    """Decode a recording and cut it to those samples of the attempt that it contains."""
     recording = Recording(attempt.recording)
     layout = recording.profile.layout()
     decoder, tracker = FrameDecoder(layout), SequenceTracker(layout)
@@ -255,7 +255,7 @@ def _decode(attempt: Attempt) -> _DecodedRecording:
     pulses.append(tracker.feed(decoder.close()))
     samples = np.concatenate(pulses)
     counter = samples["counter"]
-    backward = np.flatnonzero(np.diff(counter) <= 0)  # the unit restarted before the evidence
+    backward = np.flatnonzero(np.diff(counter) <= 0)  # the unit restarted before the attempt
     begin = int(backward[-1]) + 1 if len(backward) else 0
     counter = counter[begin:]
     if len(counter) and not begin:  # at a restart the service, too, begins with the unit's own number
@@ -279,7 +279,7 @@ def _multiple(difference: int, period: int) -> int:
 
 
 def _missing(attempt: Attempt, decoded: _DecodedRecording) -> str:
-    """Describe the longest gap in the evidence, unless the line lost these samples.
+    """Describe the longest gap in the attempt, unless the line lost these samples.
 
     If the number of samples is unknown, gaps of up to a block of 20 ms are attributed to the line: the engine
     accepts no longer ones.
