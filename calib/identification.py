@@ -192,7 +192,7 @@ class IdentificationResult:
     @property
     def arms(self) -> LeverArms:
         """The lever arms in the gauge of the estimate."""
-        return LeverArms(self.result.R_b, self.result.covariance, self.result.gauge)
+        return self.result.arms
 
     @property
     def differences_correlation(self) -> Array:

@@ -19,6 +19,7 @@ that a resumed session continues after the last one.
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from math import isnan
 from typing import Final
 
 import numpy as np
@@ -211,13 +212,14 @@ class SessionController:
         return last
 
     def _feed(self, engine: Engine, batch: Batch) -> tuple[Event, ...]:
-        """Feed samples to the engine, and status and temperatures once a second or at a change of status."""
+        """Feed samples to the engine; faults and temperatures once a second, or when the faults change."""
         events: tuple[Event, ...] = ()
         if len(batch.pulses):
             newest = batch.pulses[-1]
             conditions = _conditions(newest, self._layout)
             since_ns = int(newest["elapsed_ns"]) - self._conditions_ns
-            if conditions.bits != self._conditions.bits or not 0 <= since_ns < NS_PER_S:
+            is_due = not self._is_unit_detected or not 0 <= since_ns < NS_PER_S
+            if is_due or conditions.faults != self._conditions.faults:
                 self._conditions, self._conditions_ns = conditions, int(newest["elapsed_ns"])
                 if not self._is_unit_detected:
                     self._is_unit_detected = True
@@ -262,13 +264,10 @@ class SessionController:
 
 
 def _conditions(pulses: Records, layout: Layout) -> Conditions:
-    """Return status bits, faults and temperatures of a sample."""
-
-    def names(word: int) -> tuple[str, ...]:
-        return tuple(name for bit, name in layout.status_names if word >> bit & 1)
-
-    word = int(pulses["status"])
+    """Return faults and temperatures of a sample."""
+    faults = int(pulses["status"]) & layout.status.fault
     degc = zip(layout.temperature_names, pulses["temperature_degc"].tolist(), strict=False)
     return Conditions(
-        names(word), names(word & layout.status.fault), {name: t if t == t else None for name, t in degc}
+        tuple(name for bit, name in layout.status_names if faults >> bit & 1),
+        {name: None if isnan(t) else t for name, t in degc},
     )

@@ -6,12 +6,10 @@ from typing import Final, get_args
 
 from calib.certificate import certificate, check_target, write
 from calib.cli.arguments import (
-    KnownPoint,
     add_certificate_output,
     add_channel,
     add_gauge,
     check_output,
-    known_point,
     written_text,
 )
 from calib.estimation.result import Extra
@@ -28,8 +26,6 @@ from imudrv.terminal import progress
 EXAMPLE: Final = (
     "z-up.raw x-up.raw y-up.raw --profile imu50-rs422 --calibration unit.yaml --site site.yaml -o new.yaml"
 )
-
-_EXTRAS: Final[tuple[Extra, ...]] = get_args(Extra)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -51,29 +47,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "fixed: the origin of the body frame does not move, as on a turntable; determines all nine components"
     )
     add("--pivot", choices=("free", "fixed"), default="free", help=text)
-    text = f"estimate more parameters: {','.join(_EXTRAS)}"
-    add("--estimate", type=_extra_parameters, default=(), metavar="NAMES", help=text)
+    text = "estimate more parameters"
+    add("--estimate", choices=get_args(Extra), help=text)
     add_certificate_output(parser)
     add("--json", type=Path, metavar="R.json", help="the whole result as JSON")
     add("--report", type=Path, metavar="R.html", help="report with figures, one file")
 
 
-def _extra_parameters(text: str) -> tuple[Extra, ...]:
-    names = tuple(text.split(","))
-    if unknown := [name for name in names if name not in _EXTRAS]:
-        raise argparse.ArgumentTypeError(f"expected {' or '.join(_EXTRAS)}, got {unknown[0]!r}")
-    return tuple(name for name in _EXTRAS if name in names)
-
-
 def run(arguments: argparse.Namespace) -> None:
     """Identify the lever arms from captures."""
-    point = known_point(arguments.at)
     inputs = (*arguments.captures, arguments.profile, arguments.calibration, arguments.site)
     for output in filter(None, (arguments.output, arguments.json, arguments.report)):
         check_output(output, *inputs)
     prior = prior_calibration(arguments.captures, arguments.calibration, arguments.unit)
     check_target(arguments.output, prior.calibration)
-    nine = arguments.gauge == "given" and point is None
+    options = EstimationOptions(
+        arguments.method,
+        arguments.pivot,
+        nine=arguments.gauge == "given" and arguments.at is None,
+        extra=(arguments.estimate,) if arguments.estimate else (),
+    )
     size = sum(path.stat().st_size for path in arguments.captures if path.exists())
     with progress("identify", 2 * size) as advance:  # each capture is read twice
         result = identify(
@@ -81,11 +74,11 @@ def run(arguments: argparse.Namespace) -> None:
             site=arguments.site,
             calibration=prior,
             profile=arguments.profile,
-            options=EstimationOptions(arguments.method, arguments.pivot, nine, tuple(arguments.estimate)),
+            options=options,
             channel=arguments.channel,
             advance=advance,
         )
-    arms = _in_gauge(result.arms, arguments.gauge, point)
+    arms = _in_gauge(result.arms, arguments.gauge, arguments.at)
     gauges = (arms, convert(arms, "x" if arms.gauge == "centroid" else "centroid"))
     written = []
     try:  # files first: the reader of the text may go away
@@ -103,7 +96,7 @@ def run(arguments: argparse.Namespace) -> None:
         print(*written, sep="\n")
 
 
-def _in_gauge(arms: LeverArms, gauge: Gauge | None, point: KnownPoint | None) -> LeverArms:
+def _in_gauge(arms: LeverArms, gauge: Gauge | None, point: tuple[str, list[float]] | None) -> LeverArms:
     """Return the arms in the requested gauge, by default that of the estimate."""
     if point is None and gauge in (None, arms.gauge):
         return arms

@@ -6,6 +6,7 @@ from typing import Final, Literal
 import numpy as np
 
 from calib.detection.noise import Noise
+from calib.lever_arms.gauge import LeverArms
 from imudrv.arrays import Array
 
 Extra = Literal["quadratic"]
@@ -166,6 +167,11 @@ class LeverArmEstimate:
     leave_one_out: tuple[LeaveOneOut, ...]
     runs: tuple[RunResult, ...]
     notes: tuple[str, ...]
+
+    @property
+    def arms(self) -> LeverArms:
+        """The lever arms with covariance and gauge."""
+        return LeverArms(self.R_b, self.covariance, self.gauge)
 
     @property
     def sigma(self) -> Array:

@@ -166,8 +166,6 @@ class Engine:
         duration_s = state.duration_s
         return View(
             phase=self._phase,
-            step=p.index + 1,
-            steps=steps,
             step_id=step.id,
             title=message("title", step=p.index + 1, steps=steps, side=side(step.up), turn_deg=step.turn_deg),
             headline=headline,

@@ -33,19 +33,16 @@ class Phase(StrEnum):
 
 
 class Conditions(NamedTuple):
-    """Status of the unit beside its samples; once a second, or when it changes.
+    """Status of the unit beside its samples; once a second, or when the faults change.
 
     Parameters
     ----------
-    bits : tuple of str
-        Names of the status bits that are set.
     faults : tuple of str
-        Those that mean a fault.
+        Names of the status bits that are set and mean a fault.
     temperature_degc : mapping of str to float or None
         By channel; None: unknown.
     """
 
-    bits: tuple[str, ...] = ()
     faults: tuple[str, ...] = ()
     temperature_degc: Mapping[str, float | None] = {}
 
@@ -260,8 +257,6 @@ class View:
     ----------
     phase : Phase
         Current phase.
-    step, steps : int
-        Number of the step, from 1, and number of steps.
     step_id : str
         Id of the step.
     title : Message
@@ -292,8 +287,6 @@ class View:
     """
 
     phase: Phase
-    step: int
-    steps: int
     step_id: str
     title: Message
     headline: Message

@@ -7,7 +7,7 @@ A longer alignment would take time and change little: the rests next to the rota
 """
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Final
@@ -154,43 +154,29 @@ def case(seed: int, signs: tuple[int, ...], budget: Budget) -> tuple[list[Run], 
     return runs, lever_arms_of(real, f"case {seed}").r_b
 
 
-class Tally:
-    """Errors and covariances of one method."""
-
-    def __init__(self, method: str) -> None:
-        self.method = method
-        self.errors: list[Array] = []
-        self.covariances: list[Array] = []
-        self.chi_square: list[float] = []
-
-    def add(self, estimate: LeverArmEstimate, truth: Array) -> None:
-        """Add an estimate and the true arms."""
-        self.errors.append((estimate.R_b - truth).ravel() / MM)
-        self.covariances.append(estimate.covariance / MM**2)
-        self.chi_square.append(estimate.chi_square / max(1, estimate.degrees_of_freedom))
-
-    def statistics(self) -> Statistics:
-        """Return the statistics of all cases."""
-        errors, covariances = np.array(self.errors), np.array(self.covariances)
-        n = len(errors)
-        rms = np.sqrt((errors**2).mean(axis=1))
-        six = errors @ TO_DIFFERENCES.T
-        inverse = np.linalg.inv(TO_DIFFERENCES @ covariances @ TO_DIFFERENCES.T)
-        scatter = float(np.sqrt((errors**2).mean()))
-        predicted = float(np.sqrt(np.trace(covariances, axis1=1, axis2=2).mean() / 9.0))
-        low, high = (float(chi2.ppf(p, 6 * n)) / n for p in (0.025, 0.975))
-        return Statistics(
-            self.method,
-            n,
-            float(rms.mean()),
-            float(rms.max()),
-            scatter,
-            predicted,
-            predicted / scatter,
-            float(np.einsum("ni,nij,nj->n", six, inverse, six).mean()),
-            (low, high),
-            float(np.mean(self.chi_square)),
-        )
+def statistics(method: str, found: Sequence[tuple[LeverArmEstimate, Array]]) -> Statistics:
+    """Return the statistics of a method from its estimates, each with the true arms."""
+    errors = np.array([(estimate.R_b - truth).ravel() / MM for estimate, truth in found])
+    covariances = np.array([estimate.covariance / MM**2 for estimate, _ in found])
+    n = len(errors)
+    rms = np.sqrt((errors**2).mean(axis=1))
+    six = errors @ TO_DIFFERENCES.T
+    inverse = np.linalg.inv(TO_DIFFERENCES @ covariances @ TO_DIFFERENCES.T)
+    scatter = float(np.sqrt((errors**2).mean()))
+    predicted = float(np.sqrt(np.trace(covariances, axis1=1, axis2=2).mean() / 9.0))
+    low, high = (float(chi2.ppf(p, 6 * n)) / n for p in (0.025, 0.975))
+    return Statistics(
+        method,
+        cases=n,
+        mean_rms_mm=float(rms.mean()),
+        worst_rms_mm=float(rms.max()),
+        scatter_mm=scatter,
+        predicted_mm=predicted,
+        ratio=predicted / scatter,
+        nees=float(np.einsum("ni,nij,nj->n", six, inverse, six).mean()),
+        nees_band=(low, high),
+        chi_square_per_degree=float(np.mean([e.chi_square / max(1, e.degrees_of_freedom) for e, _ in found])),
+    )
 
 
 def run_cases(seeds: Iterable[int], signs: tuple[int, ...], budget: Budget) -> list[Statistics]:
@@ -210,9 +196,9 @@ def run_cases(seeds: Iterable[int], signs: tuple[int, ...], budget: Budget) -> l
     list of Statistics
         Of `estimate_joint` and `estimate_plain`.
     """
-    tallies = Tally("joint"), Tally("plain")
+    joint, plain = [], []
     for seed in seeds:
         runs, truth = case(seed, signs, budget)
-        for tally, method in zip(tallies, (estimate_joint, estimate_plain), strict=True):
-            tally.add(method(runs, budget.priors), truth)
-    return [tally.statistics() for tally in tallies]
+        joint.append((estimate_joint(runs, budget.priors), truth))
+        plain.append((estimate_plain(runs, budget.priors), truth))
+    return [statistics("joint", joint), statistics("plain", plain)]

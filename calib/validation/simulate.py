@@ -17,7 +17,6 @@ from calib.detection.acceptance import RotationLimits
 from calib.estimation.joint import estimate_joint
 from calib.estimation.result import LeverArmEstimate
 from calib.estimation.runs import NavigationOptions, Run, navigate_capture
-from calib.lever_arms.gauge import LeverArms
 from calib.validation.navigate import navigate
 from calib.validation.trial import RATE_FILTER, Trial, TrialSettings
 from imudrv import profiles
@@ -62,14 +61,16 @@ class SimulatedUnit:
         Known calibration: the nominal one with the identified lever arms.
     result : LeverArmEstimate
         The estimate.
-    skew_s : float
-        Estimated skew of the accelerometer samples, s.
     """
 
     real: Calibration
     found: Calibration
     result: LeverArmEstimate
-    skew_s: float
+
+    @property
+    def skew_s(self) -> float:
+        """Estimated skew of the accelerometer samples, s."""
+        return next(n.value for n in self.result.parameters if n.name == "skew_s")
 
 
 def subject(unit: Unit, seed: int, *, procedure: Sequence[str] = PROCEDURE) -> SimulatedUnit:
@@ -95,14 +96,8 @@ def subject(unit: Unit, seed: int, *, procedure: Sequence[str] = PROCEDURE) -> S
         run for k, name in enumerate(procedure) for run in _simulated_runs(name, built, [seed, k], nominal)
     ]
     result = estimate_joint(runs)
-    skew_s = next(n.value for n in result.parameters if n.name == "skew_s")
-    arms = LeverArms(result.R_b, result.covariance, result.gauge)
-    return SimulatedUnit(
-        real,
-        with_lever_arms(nominal, arms, PROVENANCE_IDENTIFIED, {"method": result.method}),
-        result,
-        skew_s,
-    )
+    found = with_lever_arms(nominal, result.arms, PROVENANCE_IDENTIFIED, {"method": result.method})
+    return SimulatedUnit(real, found, result)
 
 
 def true_calibration(unit: Unit, seed: int) -> Calibration:

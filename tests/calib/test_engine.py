@@ -498,7 +498,7 @@ def test_a_fault_of_the_unit_is_named_and_it_waits_until_it_is_gone(drive: Drive
     turned["flags"][20_000:22_000] |= np.uint32(Flag.FAULT)
     driver = drive()
     driver.feed(turned[:19_000])
-    driver.engine.update_status(Conditions(("dither fault",), ("dither fault",), {}))
+    driver.engine.update_status(Conditions(("dither fault",), {}))
     driver.feed(turned[19_000:])
 
     restarted = driver.of(Restarted)[0]
@@ -684,7 +684,7 @@ def test_temperature_noise_and_faults_are_held_against_the_limits(drive: Drive, 
     turned["dv_b"] += 8e-5 * rng.standard_normal(turned["dv_b"].shape)
     driver = drive(calibration=calibration, limits={"noise_mg": 0.5})
     driver.engine.update_status(
-        Conditions(("power", "warm-up"), ("power",), {"gyro": 48.25, "accelerometer_x": None})
+        Conditions(("power",), {"gyro": 48.25, "accelerometer_x": None})
     )
     driver.feed(part(turned, 0.0, CHECK_S))
 

@@ -43,8 +43,6 @@ HEADLINES = (
 
 def view(phase: Phase = Phase.PLACE, headline: str = "TURN IT: X UP", **changes: Any) -> View:
     values: dict[str, Any] = {
-        "step": 2,
-        "steps": 3,
         "step_id": "x-up",
         "title": "step 2 of 3: X up, +180 deg",
         "hints": (),
