@@ -25,6 +25,7 @@ Data flow; every module can be read alone::
     validation      navigation with and without compensation, on recordings and simulated units
     dither          effect of gyro dither on the size effect
     reports         reports as text, for a terminal and as HTML
+    messages        texts for the operator, by key
     api             functions for a notebook      cli  the command `calib`
 
 Increments are compensated for everything except the size effect. The conventions are those of `imudrv`.

@@ -22,6 +22,7 @@ from calib.estimation.result import TO_DIFFERENCES, Extra, LeverArmEstimate, Run
 from calib.estimation.runs import CaptureRuns, Priors, Run, navigate_capture
 from calib.inputs import StrPath, profile_of, site_of
 from calib.lever_arms.gauge import LeverArms
+from calib.messages import english
 from imudrv.arrays import Array
 from imudrv.calibration import Calibration, read_calibration_file
 from imudrv.capture import Capture
@@ -400,7 +401,8 @@ def _rejections(sources: Sequence[CaptureSummary]) -> list[str]:
             seconds = source.rotations.segments.duration_s
             lines.append(f"{source.name}: {seconds:.1f} s at rest, no motion at all")
         lines += [
-            f"{source.name}: motion at {rotation.start_s:.1f}..{rotation.stop_s:.1f} s: {'; '.join(reasons)}"
+            f"{source.name}: motion at {rotation.start_s:.1f}..{rotation.stop_s:.1f} s: "
+            + "; ".join(map(english, reasons))
             for rotation, reasons in source.rotations.rejected
         ]
     return lines

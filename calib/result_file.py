@@ -10,6 +10,7 @@ from calib.estimation.result import LeverArmEstimate
 from calib.estimation.runs import Priors, Run
 from calib.identification import CaptureSummary, IdentificationResult, scatter
 from calib.lever_arms.gauge import LeverArms
+from calib.messages import english
 from imudrv.arrays import Array
 from imudrv.files.atomic import atomic_write
 from imudrv.units import ARCSEC, DEG, DEG_PER_H, MM, PPM, STANDARD_GRAVITY, UG, URAD
@@ -136,7 +137,7 @@ def _capture(source: CaptureSummary) -> dict[str, Any]:
         "temperature_degc": {t.channel: [t.least_degc, t.most_degc] for t in source.temperatures},
         "runs": [run.label for run in rotations.runs],
         "rejected": [
-            {"start_s": rotation.start_s, "stop_s": rotation.stop_s, "reasons": list(reasons)}
+            {"start_s": rotation.start_s, "stop_s": rotation.stop_s, "reasons": [*map(english, reasons)]}
             for rotation, reasons in rotations.rejected
         ],
     }

@@ -42,9 +42,9 @@ from calib.bench.resume import require_temperature
 from calib.bench.screen import OperatorScreen, with_port_state
 from calib.bench.session import Session
 from calib.bench.state import REPORT
+from calib.messages import english
 from calib.procedure.engine import Engine
 from calib.procedure.events import Aborted, Accepted, Conditions, Entered, Event, Finished, Phase, Rejected
-from calib.procedure.messages import english
 from calib.procedure.plan import steps_left, verification
 from calib.procedure.schema import VERIFICATION, Procedure
 from imudrv.errors import InputError
@@ -136,8 +136,7 @@ class SessionController:
             if isinstance(last, Aborted):
                 return
             if last.reasons:
-                missing = "\n  ".join(map(english, last.reasons))
-                raise InputError(f"too few steps are accepted; resume and do the skipped ones:\n  {missing}")
+                raise InputError(f"no result: {'; '.join(map(english, last.reasons))}; resume the session")
             session.append(last)
         self._screen.print("Computing the lever arms from the recordings ...")
         result = session_result(session)

@@ -24,6 +24,7 @@ from calib.identification import (
     PriorCalibration,
     temperature_ranges,
 )
+from calib.messages import english
 from calib.procedure.schema import VERIFICATION, Procedure
 from imudrv.calibration import Calibration
 from imudrv.errors import InputError
@@ -226,10 +227,10 @@ def _navigate(
         NavigationOptions(limits, expected=attempt.step.up[1]),
     )
     if len(navigated.runs) != 1:
-        reasons = "; ".join(reason for _, reasons in navigated.rejected for reason in reasons) or "no motion"
+        reasons = "; ".join(english(reason) for _, reasons in navigated.rejected for reason in reasons)
         raise InputError(
             f"{attempt.recording}: expected the one rotation that was accepted, got {len(navigated.runs)}: "
-            f"{reasons}"
+            f"{reasons or 'no motion'}"
         )
     return navigated
 

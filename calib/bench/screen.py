@@ -16,8 +16,8 @@ from rich.table import Table
 from rich.text import Text
 
 from calib.bench import block_letters
+from calib.messages import english, message, verbatim
 from calib.procedure.events import Phase, View
-from calib.procedure.messages import english, message, verbatim
 from imudrv.diagnosis import LineState
 
 NO_DATA: Final = message("no_data")

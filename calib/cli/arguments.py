@@ -6,6 +6,7 @@ from typing import Any, Final
 
 from calib.lever_arms.gauge import GAUGES, LeverArms
 from imudrv.calibration import Calibration
+from imudrv.errors import InputError
 from imudrv.files.outputs import file_to_write, require_other
 from imudrv.units import MM
 
@@ -14,11 +15,11 @@ PROGRAMS: Final = ("kalibr", "psins")
 
 
 def add_gauge(parser: argparse.ArgumentParser, option: str, **more: Any) -> None:
-    """Add the gauge under the name of an option, and ``--at``, a known sensing point."""
+    """Add the gauge under the name of an option, and ``--at``, see `known_point`."""
     text = "origin of the body frame"
     parser.add_argument(option, dest="gauge", choices=GAUGES, help=text, **more)
     text = "for gauge given: known sensing point of accelerometer A, mm, such as y=12.5,-3,40"
-    parser.add_argument("--at", type=_known_point, metavar="A=X,Y,Z", help=text)
+    parser.add_argument("--at", metavar="A=X,Y,Z", help=text)
 
 
 def add_channel(parser: argparse.ArgumentParser) -> None:
@@ -32,16 +33,18 @@ def add_certificate_output(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="NEW.yaml", help=text)
 
 
-def _known_point(text: str) -> tuple[str, list[float]]:
+def known_point(text: str | None) -> tuple[str, list[float]] | None:
     """Parse an accelerometer and its sensing point, mm, such as ``y=12.5,-3,40``; return it in m."""
+    if text is None:
+        return None
     accelerometer, _, rest = text.partition("=")
     try:
         point = [float(value) * MM for value in rest.split(",")]
     except ValueError:
         point = []
     if accelerometer not in ("x", "y", "z") or len(point) != 3:
-        raise argparse.ArgumentTypeError(
-            f"expected an accelerometer and three numbers in mm, such as y=12.5,-3,40, got {text!r}"
+        raise InputError(
+            f"--at: expected an accelerometer and three numbers in mm, such as y=12.5,-3,40, got {text!r}"
         )
     return accelerometer, point
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from calib.certificate import PROVENANCE_CONVERTED, lever_arms_of, with_lever_arms, write
-from calib.cli.arguments import add_certificate_output, add_gauge, check_output, written_text
+from calib.cli.arguments import add_certificate_output, add_gauge, check_output, known_point, written_text
 from calib.lever_arms.gauge import convert
 from calib.reports.identification import arms_text
 from imudrv.calibration import read_calibration_file
@@ -26,10 +26,11 @@ def run(arguments: argparse.Namespace) -> None:
     check_output(arguments.output, arguments.file)
     file = read_calibration_file(arguments.file)
     before = lever_arms_of(file.model, str(arguments.file))
-    arms = convert(before, arguments.gauge, arguments.at)
+    point = known_point(arguments.at)
+    arms = convert(before, arguments.gauge, point)
     how: dict[str, Any] = {"from": before.gauge, "to": arms.gauge, "file_sha256": file.sha256}
-    if arguments.at is not None:
-        accelerometer, r_b = arguments.at
+    if point is not None:
+        accelerometer, r_b = point
         how["stated_mm"] = {accelerometer: [value / MM for value in r_b]}
     write(arguments.output, with_lever_arms(file.model, arms, PROVENANCE_CONVERTED, how))
     print(arms_text(arms), end="")

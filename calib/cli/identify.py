@@ -10,6 +10,7 @@ from calib.cli.arguments import (
     add_channel,
     add_gauge,
     check_output,
+    known_point,
     written_text,
 )
 from calib.estimation.result import Extra
@@ -56,6 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Identify the lever arms from captures."""
+    point = known_point(arguments.at)
     inputs = (*arguments.captures, arguments.profile, arguments.calibration, arguments.site)
     for output in filter(None, (arguments.output, arguments.json, arguments.report)):
         check_output(output, *inputs)
@@ -64,7 +66,7 @@ def run(arguments: argparse.Namespace) -> None:
     options = EstimationOptions(
         arguments.method,
         arguments.pivot,
-        nine=arguments.gauge == "given" and arguments.at is None,
+        nine=arguments.gauge == "given" and point is None,
         extra=(arguments.estimate,) if arguments.estimate else (),
     )
     size = sum(path.stat().st_size for path in arguments.captures if path.exists())
@@ -78,7 +80,7 @@ def run(arguments: argparse.Namespace) -> None:
             channel=arguments.channel,
             advance=advance,
         )
-    arms = _in_gauge(result.arms, arguments.gauge, arguments.at)
+    arms = _in_gauge(result.arms, arguments.gauge, point)
     gauges = (arms, convert(arms, "x" if arms.gauge == "centroid" else "centroid"))
     written = []
     try:  # files first: the reader of the text may go away

@@ -10,5 +10,4 @@ attempt      samples of one attempt at a step
 events       actions, events and views
 preflight    check of the sensors before the first step
 prompts      what the operator has to do
-messages     keys with values, and a catalogue for each language
 """

@@ -11,7 +11,7 @@ from typing import Final, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.procedure.messages import Message
+from calib.messages import Message
 from imudrv.arrays import Array
 
 PREFLIGHT: Final = "preflight"

@@ -15,8 +15,8 @@ import numpy as np
 
 from calib.axes import axis_name, side
 from calib.detection.tracking import MG, RestAverages
+from calib.messages import Message, message
 from calib.procedure.events import Conditions
-from calib.procedure.messages import Message, message
 from calib.procedure.prompts import fault_message, lean_message, turn_message
 from calib.procedure.schema import ProcedureLimits, Step
 from imudrv.arrays import Array

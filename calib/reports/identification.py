@@ -16,6 +16,7 @@ from calib.estimation.result import LeverArmEstimate, ParameterEstimate, RunResu
 from calib.estimation.runs import Priors, Run
 from calib.identification import CaptureSummary, IdentificationResult, scatter
 from calib.lever_arms.gauge import LeverArms
+from calib.messages import english
 from calib.reports import figures
 from calib.reports.document import Block, Document, Figure, KeyValues, Paragraph, Section, Table, sanitise
 from calib.reports.format import counted, decimals, mm, three_digits
@@ -298,7 +299,7 @@ def _rejected(sources: Sequence[CaptureSummary]) -> Iterator[Block]:
                     f"{sanitise(name)} from {rotation.start_s:.1f} to {rotation.stop_s:.1f} s, "
                     f"{rotation.angle_deg:+.1f} deg about {rotation.axis} up",
                 ),
-                *(("rejected", reason) for reason in reasons),
+                *(("rejected", english(reason)) for reason in reasons),
             )
         )
     if not rejected:

@@ -32,8 +32,8 @@ from calib.bench.screen import OperatorScreen, plain
 from calib.bench.session import Session
 from calib.bench.technician import BENCH, Mistake, technician_scenario
 from calib.bench.verify import verify
+from calib.messages import english
 from calib.procedure.events import Accepted, Entered, Phase, Rejected, View
-from calib.procedure.messages import english
 from calib.procedure.plan import steps_left
 from calib.procedure.schema import Procedure
 from imudrv import profiles

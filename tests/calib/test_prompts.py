@@ -11,12 +11,12 @@ from string import Formatter
 import pytest
 
 import calib
+from calib.messages import Message, catalogue, english, message, verbatim
 from calib.procedure.events import Rejected
-from calib.procedure.messages import Message, catalogue, english, message, verbatim
 
 LANGUAGES = [
     path.name.removesuffix(".yaml")
-    for path in resources.files("calib.procedure.messages").iterdir()
+    for path in resources.files("calib.messages").iterdir()
     if path.name.endswith(".yaml")
 ]
 HEADLINE = 38  # characters: what a screen of 80 columns has in letters of three rows

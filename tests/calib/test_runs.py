@@ -100,7 +100,7 @@ def test_means_are_those_of_all_samples(bench: Bench, step: Step, site: Site) ->
 def test_what_the_procedure_expects_is_judged(session: Records, site: Site) -> None:
     found = navigated(session, site, expected="X")
     assert found.runs == ()
-    assert all("about" in reasons[0] for _, reasons in found.rejected)
+    assert all(reasons[0].key == "wrong_vertical" for _, reasons in found.rejected)
 
 
 def test_gravity_is_the_sites_own(bench: Bench, step: Step, site: Site) -> None:

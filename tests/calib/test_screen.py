@@ -16,8 +16,8 @@ from rich.console import Console
 from calib.bench import block_letters
 from calib.bench.keys import Keyboard
 from calib.bench.screen import NO_DATA, NO_FRAMES, OperatorScreen, plain, screen, with_port_state
+from calib.messages import english, verbatim
 from calib.procedure.events import Abort, Confirm, Phase, Redo, Skip, View
-from calib.procedure.messages import english, verbatim
 from imudrv.diagnosis import LineState
 
 DEADLINE_S = 20.0

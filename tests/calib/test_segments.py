@@ -5,14 +5,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.detection.acceptance import RotationLimits, expected_error_mm, rejection_reasons
+from calib.detection import acceptance
+from calib.detection.acceptance import RotationLimits, expected_error_mm
 from calib.detection.segments import Rotation, Segments, find_segments
+from calib.messages import english
 from imudrv.errors import InputError
 from imudrv.records import Flag, Records
 
 Bench = Callable[..., Records]
 Step = Callable[..., Any]
 LIMITS = RotationLimits()
+
+
+def rejection_reasons(rotation: Rotation, limits: RotationLimits, **more: Any) -> tuple[str, ...]:
+    """English reasons."""
+    return tuple(map(english, acceptance.rejection_reasons(rotation, limits, **more)))
 
 
 def only(segments: Segments) -> Rotation:

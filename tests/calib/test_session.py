@@ -26,8 +26,8 @@ from calib.bench.resume import check_files, require_same, require_temperature, r
 from calib.bench.session import Session
 from calib.bench.state import INITIAL_CERTIFICATE, JOURNAL
 from calib.bench.verify import verify
+from calib.messages import Message, english
 from calib.procedure.events import Entered, Finished, Phase, Redone
-from calib.procedure.messages import Message, english
 from imudrv.calibration import Calibration, read_calibration_file, write_calibration
 from imudrv.errors import InputError
 from imudrv.files import atomic, settings_file

@@ -12,9 +12,9 @@ from calib.bench.technician import Mistake, technician_scenario
 from calib.estimation.joint import estimate_joint
 from calib.estimation.result import TO_DIFFERENCES, LeverArmEstimate
 from calib.estimation.runs import NavigationOptions, navigate_rotations
+from calib.messages import english
 from calib.procedure.engine import Engine
 from calib.procedure.events import Accepted, Event, Finished, Phase, Rejected, Restarted
-from calib.procedure.messages import english
 from calib.procedure.plan import load, predicted
 from calib.procedure.schema import Procedure
 from imudrv import Coefficients, Compensator, coefficients, load_profile, rate_filter
