@@ -85,7 +85,7 @@ def unit(serial_number: str = "50-0017") -> Calibration:
     return NOMINAL.model_copy(update={"serial_number": serial_number, "provenance": provenance})
 
 
-def test_a_certificate_comes_back_from_its_file_with_arms_covariance_and_gauge(tmp_path: Path) -> None:
+def test_a_certificate_read_from_its_file_has_the_same_arms_covariance_and_gauge(tmp_path: Path) -> None:
     found = identification()
     path = tmp_path / "new.yaml"
     write(path, certificate(found, found.arms))
@@ -101,7 +101,7 @@ def test_a_certificate_comes_back_from_its_file_with_arms_covariance_and_gauge(t
     assert np.linalg.matrix_rank(back.covariance, tol=1e-13) == 6
 
 
-def test_the_certificate_keeps_the_static_calibration_and_says_how_the_arms_were_found() -> None:
+def test_the_certificate_keeps_the_static_calibration_and_has_the_provenance_of_the_arms() -> None:
     found = identification()
     new = certificate(found, found.arms)
     assert new.gyro == found.prior_calibration.calibration.gyro

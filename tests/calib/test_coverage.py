@@ -82,7 +82,7 @@ def test_a_narrow_counter_wraps_before_and_within_the_recording(
     )
 
 
-def test_samples_before_a_restart_of_the_unit_are_no_evidence(recorded: Recorded, tmp_path: Path) -> None:
+def test_samples_before_a_restart_of_the_unit_are_not_used(recorded: Recorded, tmp_path: Path) -> None:
     path = recorded(tmp_path / "run.mcap", [*range(1000, 3000), *range(1900, 5500)])
     assert uncovered(attempt(path)) == ""
     late = recorded(tmp_path / "late.mcap", [*range(1000, 5500), *range(2100, 5500)])

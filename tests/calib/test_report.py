@@ -98,7 +98,7 @@ def test_the_page_loads_nothing_and_runs_nothing(page: str) -> None:
     assert len(page) < 1_500_000
 
 
-def test_its_figures_are_whole_drawings_that_load_nothing_either(page: str) -> None:
+def test_its_figures_are_complete_and_load_nothing_from_elsewhere(page: str) -> None:
     images = re.findall(r'src="data:image/svg\+xml;base64,([^"]+)"', page)
     assert len(images) == 1 + 3 + 1 + 1  # points, a run each, before and after, directions
     for image in images:
@@ -108,7 +108,7 @@ def test_its_figures_are_whole_drawings_that_load_nothing_either(page: str) -> N
         assert not re.search(r'(?:href|src)="(?!#)', drawing)
 
 
-def test_what_comes_from_files_is_escaped(
+def test_text_from_files_is_escaped(
     page: str, identification: IdentificationResult, arms: tuple[LeverArms, LeverArms]
 ) -> None:
     assert "<img src=x" not in page

@@ -97,7 +97,7 @@ def test_means_are_those_of_all_samples(bench: Bench, step: Step, site: Site) ->
     np.testing.assert_allclose(run.v_n[1:][run.before[1:]], smooth[run.before[1:]], atol=3e-5)
 
 
-def test_what_the_procedure_expects_is_judged(session: Records, site: Site) -> None:
+def test_a_rotation_about_another_axis_than_expected_is_rejected(session: Records, site: Site) -> None:
     found = navigated(session, site, expected="X")
     assert found.runs == ()
     assert all(reasons[0].key == "wrong_vertical" for _, reasons in found.rejected)
