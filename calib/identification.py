@@ -324,21 +324,18 @@ def prior_calibration(
                 f"{path}: expected a calibration, got a capture without one; give its file (--calibration)"
             )
         texts.setdefault(text, path)
+    if not texts:
+        raise InputError("captures: expected one file at least, got none")
     if len(texts) > 1:
         raise InputError(
             "expected recordings made with one calibration, got different ones in "
             f"{' and '.join(map(str, texts.values()))}; give the right one (--calibration)"
         )
-    for text, path in texts.items():
-        model = settings_file.parse_text(text.encode(), Calibration, f"{path}: calibration")
-        if unit not in (None, model.serial_number):
-            raise InputError(
-                f"{path}: expected a recording of unit {unit!r}, got one of {model.serial_number!r}"
-            )
-        return PriorCalibration(
-            model, f"calibration in {path.name}", hashlib.sha256(text.encode()).hexdigest()
-        )
-    raise InputError("captures: expected one file at least, got none")
+    ((text, path),) = texts.items()
+    model = settings_file.parse_text(text.encode(), Calibration, f"{path}: calibration")
+    if unit not in (None, model.serial_number):
+        raise InputError(f"{path}: expected a recording of unit {unit!r}, got one of {model.serial_number!r}")
+    return PriorCalibration(model, f"calibration in {path.name}", hashlib.sha256(text.encode()).hexdigest())
 
 
 def _paths(captures: StrPath | Sequence[StrPath]) -> list[Path]:

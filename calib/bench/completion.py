@@ -3,14 +3,12 @@
 from calib.bench.entries import ResidualVelocity
 from calib.bench.keys import Keyboard
 from calib.bench.queue_sink import QueueReader
-from calib.bench.result import Result, identify_session, residual_velocity
+from calib.bench.result import Result, identify_session
 from calib.bench.screen import OperatorScreen
 from calib.bench.session import Session
 from calib.bench.state import REPORT, RESULT
 from calib.certificate import write
 from calib.lever_arms.gauge import convert
-from calib.procedure.plan import verification
-from calib.procedure.schema import VERIFICATION
 from calib.reports.identification import arms_text, report_html, verdict
 from imudrv.calibration import Calibration, read_calibration, write_calibration
 from imudrv.errors import InputError
@@ -91,12 +89,6 @@ def activate(session: Session, certificate: Calibration) -> None:
             f"{active.path}: expected the certificate that the session began with, it was changed meanwhile; "
             f"it is kept as it is, the result is in {session.folder / RESULT}"
         )
-
-
-def verification_residual(session: Session, certificate: Calibration) -> ResidualVelocity:
-    """Return the residual velocity after the verification rotation."""
-    procedure = verification(session.procedure())
-    return residual_velocity(procedure, session.attempts()[VERIFICATION], certificate, session.site())
 
 
 def write_report(session: Session, result: Result, residual: ResidualVelocity | None) -> None:

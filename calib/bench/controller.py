@@ -30,14 +30,13 @@ from calib.bench.completion import (
     decide_alone,
     session_result,
     summary,
-    verification_residual,
     write_report,
 )
 from calib.bench.entries import Counted, Decision, ServiceMessage, SessionEnded, UnitDetected
 from calib.bench.keys import Keyboard
 from calib.bench.queue_sink import QueueReader, QueueSink, ServiceEndedError
 from calib.bench.recordings import AttemptRecordings
-from calib.bench.result import Result
+from calib.bench.result import Result, residual_velocity
 from calib.bench.resume import require_temperature
 from calib.bench.screen import OperatorScreen, with_port_state
 from calib.bench.session import Session
@@ -151,7 +150,7 @@ class SessionController:
             return
         residual = None
         if VERIFICATION in last.accepted:
-            residual = verification_residual(session, result.certificate)
+            residual = residual_velocity(session, result.certificate)
         if session.stage(SessionEnded) is None:
             write_report(session, result, residual)
             session.append(SessionEnded(residual))

@@ -25,6 +25,7 @@ from calib.identification import (
     temperature_ranges,
 )
 from calib.messages import english
+from calib.procedure.plan import verification
 from calib.procedure.schema import VERIFICATION, Procedure
 from imudrv.calibration import Calibration
 from imudrv.errors import InputError
@@ -59,7 +60,7 @@ class Result(NamedTuple):
     certificate: Calibration
 
 
-class _DecodedRecording(NamedTuple):
+class DecodedRecording(NamedTuple):
     """Decoded samples of an attempt.
 
     Attributes
@@ -142,37 +143,15 @@ def uncovered(attempt: Attempt) -> str:
     return _missing(attempt, _decode(attempt))
 
 
-def require_covered(attempt: Attempt) -> None:
-    """Refuse an attempt whose recording lacks samples.
+def residual_velocity(session: SessionState, calibration: Calibration) -> ResidualVelocity:
+    """Return the velocity after the verification rotation, without and with compensation.
 
     Parameters
     ----------
-    attempt : Attempt
-        An accepted attempt.
-
-    Raises
-    ------
-    InputError
-        Samples are missing, or the recording cannot be read; the message says which and what to do.
-    """
-    _decode_covered(attempt)
-
-
-def residual_velocity(
-    procedure: Procedure, attempt: Attempt, calibration: Calibration, site: Site
-) -> ResidualVelocity:
-    """Return the residual velocity after a rotation, without and with compensation.
-
-    Parameters
-    ----------
-    procedure : Procedure
-        Procedure with the attempt's step.
-    attempt : Attempt
-        An accepted attempt.
+    session : SessionState
+        A session whose verification is accepted.
     calibration : Calibration
         Certificate with its size effect.
-    site : Site
-        Site of the bench.
 
     Returns
     -------
@@ -183,10 +162,11 @@ def residual_velocity(
     InputError
         The recording cannot be read or lacks its rotation.
     """
-    decoded = _decode_covered(attempt)
+    procedure, attempt = verification(session.procedure()), session.attempts()[VERIFICATION]
+    decoded = decode_covered(attempt)
     residual = []
     for used in (calibration.without_size_effect(), calibration):
-        run = _navigate(procedure, attempt, decoded, used, site).runs[0]
+        run = _navigate(procedure, attempt, decoded, used, session.site()).runs[0]
         V, _ = velocity_gain(run)
         residual.append(float(np.hypot(V[0], V[1])))
     return ResidualVelocity(*residual)
@@ -196,7 +176,7 @@ def _summarise(
     procedure: Procedure, attempt: Attempt, calibration: Calibration, site: Site
 ) -> CaptureSummary:
     with atomic.unchanged(attempt.recording):
-        decoded = _decode_covered(attempt)
+        decoded = decode_covered(attempt)
         digest = atomic.sha256(attempt.recording)
     layout, degc = decoded.layout, decoded.pulses["temperature_degc"]
     return CaptureSummary(
@@ -213,7 +193,7 @@ def _summarise(
 def _navigate(
     procedure: Procedure,
     attempt: Attempt,
-    decoded: _DecodedRecording,
+    decoded: DecodedRecording,
     calibration: Calibration,
     site: Site,
 ) -> CaptureRuns:
@@ -235,8 +215,14 @@ def _navigate(
     return navigated
 
 
-def _decode_covered(attempt: Attempt) -> _DecodedRecording:
-    """Decode a recording and cut it to the samples of the attempt, which must be complete."""
+def decode_covered(attempt: Attempt) -> DecodedRecording:
+    """Decode a recording and cut it to the samples of the attempt.
+
+    Raises
+    ------
+    InputError
+        Samples are missing, or the recording cannot be read; the message says which and what to do.
+    """
     decoded = _decode(attempt)
     if lacks := _missing(attempt, decoded):
         step, folder = attempt.step.id, attempt.recording.parent
@@ -247,7 +233,7 @@ def _decode_covered(attempt: Attempt) -> _DecodedRecording:
     return decoded
 
 
-def _decode(attempt: Attempt) -> _DecodedRecording:
+def _decode(attempt: Attempt) -> DecodedRecording:
     """Decode a recording and cut it to those samples of the attempt that it contains."""
     recording = Recording(attempt.recording)
     layout = recording.profile.layout()
@@ -262,7 +248,7 @@ def _decode(attempt: Attempt) -> _DecodedRecording:
     if len(counter) and not begin:  # at a restart the service, too, begins with the unit's own number
         counter = counter + _offset(recording, attempt, int(counter[0]), 1 << layout.counter_bits)
     first, stop = np.searchsorted(counter, [attempt.first_counter, attempt.last_counter + 1])
-    return _DecodedRecording(
+    return DecodedRecording(
         samples[begin + first : begin + stop], counter[first:stop], layout, tracker.counts
     )
 
@@ -279,7 +265,7 @@ def _multiple(difference: int, period: int) -> int:
     return (2 * difference + period) // (2 * period) * period
 
 
-def _missing(attempt: Attempt, decoded: _DecodedRecording) -> str:
+def _missing(attempt: Attempt, decoded: DecodedRecording) -> str:
     """Describe the longest gap in the attempt, unless the line lost these samples.
 
     If the number of samples is unknown, gaps of up to a block of 20 ms are attributed to the line: the engine

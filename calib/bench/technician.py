@@ -84,7 +84,6 @@ def technician_scenario(
     mistakes: Sequence[Mistake] = (),
     *,
     seed: int = 1,
-    site: Site = BENCH,
     calibration: Calibration | None = None,
 ) -> Scenario:
     """Return the scenario of a procedure carried out by hand.
@@ -97,8 +96,6 @@ def technician_scenario(
         At most one per step; the step is repeated after it.
     seed : int
         Random seed of the unit's errors, its lever arms, and the technician's hands.
-    site : Site
-        Site of the bench.
     calibration : Calibration, optional
         Certificate of the unit; its `size_effect` is the truth. Default: `true_calibration` of the seed.
 
@@ -129,7 +126,7 @@ def technician_scenario(
         format="imu50-scenario",
         version=1,
         seed=seed,
-        site=site,
+        site=BENCH,
         start=hands.start,
         motion=tuple(hands.motion),
         unit=Unit(

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from calib.bench import journal
-from calib.bench.result import identify_session, require_covered
+from calib.bench.result import decode_covered, identify_session
 from calib.bench.state import JOURNAL, LOCK, RESULT, SessionState, require_session
 from calib.certificate import PROVENANCE_IDENTIFIED
 from imudrv.calibration import Calibration, read_calibration
@@ -94,7 +94,7 @@ def uncovered_steps(session: SessionState) -> list[str]:
     faults = []
     for attempt in session.attempts().values():
         try:
-            require_covered(attempt)
+            decode_covered(attempt)
         except InputError as error:
             faults.append(str(error))
     return faults

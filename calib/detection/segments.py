@@ -86,15 +86,12 @@ class Rest(Interval):
         Body axis that points up, '+X' to '-Z'.
     up_b : ndarray, shape (3,)
         Unit vector up, body axes.
-    f_b : ndarray, shape (3,)
-        Mean specific force, m/s^2.
     differences : SecondDifferences or None
         For the noise; None: the rest is too short.
     """
 
     up: str
     up_b: Array
-    f_b: Array
     differences: SecondDifferences | None
 
     @property
@@ -141,8 +138,6 @@ class Segments:
 
     Attributes
     ----------
-    first : int
-        Counter of the first sample.
     interval_s : float
         Sample interval.
     duration_s : float
@@ -153,7 +148,6 @@ class Segments:
         Every motion, in order.
     """
 
-    first: int
     interval_s: float
     duration_s: float
     rests: tuple[Rest, ...]
@@ -289,7 +283,6 @@ def _segments(blocks: _Blocks) -> Segments:
     before = {stop: rest for (_, stop), rest in zip(still, rests, strict=True)}
     after = {begin: rest for (begin, _), rest in zip(still, rests, strict=True)}
     return Segments(
-        blocks.first,
         blocks.interval_s,
         (blocks.end - blocks.first) * blocks.interval_s,
         tuple(rests),
@@ -343,7 +336,6 @@ def _rest(blocks: _Blocks, begin: int, stop: int) -> Rest:
         **vars(blocks.interval(begin, stop)),
         up=axis_name(f_b),
         up_b=f_b / np.linalg.norm(f_b),
-        f_b=f_b,
         differences=_second_differences(rows, round(BIN_S / (blocks.size * blocks.interval_s)), f_b),
     )
 

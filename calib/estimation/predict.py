@@ -160,7 +160,7 @@ def _planned_run(planned: PlannedRotation, k: int, latitude_rad: float, priors: 
         priors.gyro_bias / earth_rate_n(latitude_rad)[1],
         tan(latitude_rad) * priors.accelerometer_bias / gravity,
     )
-    rest = Rest(0, before, 0.0, before * T, 0, planned.up, up_b, gravity * up_b, None)
+    rest = Rest(0, before, 0.0, before * T, 0, planned.up, up_b, None)
     rotation = AcceptedRotation(
         before,
         before + n,

@@ -129,7 +129,7 @@ def test_a_capture_is_validated_with_its_lever_arms(here: Path) -> None:
     # identification needs no arms, compensation does; with the true ones hardly any velocity is left
     settings = {"calibration": "unit.yaml", "site": Path("site.yaml"), "profile": PROFILE}
     validation = calib.validate("z_up.raw", **settings, align_s=30.0)
-    assert validation.metrics.good
+    assert validation.good
     assert validation.trial.name == "z_up.raw"
     assert "z_up.raw: good; velocity after the motion" in repr(validation)
     write_calibration(here / "bare.yaml", NOMINAL.without_size_effect())

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from calib.bench.result import require_covered, uncovered
+from calib.bench.result import decode_covered, uncovered
 from calib.bench.state import Attempt
 from calib.procedure.schema import Step
 from imudrv import profiles
@@ -45,12 +45,12 @@ def test_what_the_recording_does_not_cover_is_named(
     words = f"its recording does not cover counters {gap}" if gap else ""
     assert uncovered(attempt(path, samples)) == words
     if not gap:
-        require_covered(attempt(path, samples))
+        decode_covered(attempt(path, samples))
         return
     with pytest.raises(
         InputError, match=rf"step z-up: {words}; .*calib run --session {tmp_path} --redo z-up"
     ):
-        require_covered(attempt(path, samples))
+        decode_covered(attempt(path, samples))
 
 
 def test_samples_lost_on_the_line_are_not_missing_from_the_recording(

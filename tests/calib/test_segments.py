@@ -230,7 +230,7 @@ def test_a_short_last_block_is_no_motion(bench: Bench, step: Step, samples: int)
     rows["dtheta_b"][-1] += 1e-5  # a pulse of two arcsec alone in a few samples
     found = find_segments([rows])
     assert len(found.rotations) == 1
-    assert found.rests[-1].stop - found.first == 20_000
+    assert found.rests[-1].stop - found.rests[0].start == 20_000
 
 
 def test_no_error_is_extrapolated_for_what_is_no_turn(bench: Bench, step: Step) -> None:
