@@ -252,7 +252,7 @@ def points(*rows: list[float], gauge: str) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("gauge", ["centroid", "x", "y", "z"])
-def test_the_origin_is_where_the_gauge_says(gauge: str) -> None:
+def test_each_gauge_has_its_origin(gauge: str) -> None:
     rows = np.array([[24.0, -11.0, 1.0], [-30.0, 20.0, 3.0], [7.0, -9.0, -4.0]])
     origin = rows.mean(axis=0) if gauge == "centroid" else rows["xyz".index(gauge)]
     # Rounded to six decimals, as people write files.

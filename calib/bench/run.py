@@ -2,6 +2,7 @@
 
 import os
 import tempfile
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -67,7 +68,7 @@ class RunOptions:
         Use a simulated unit and technician, hands free.
     speed : str
         Speed of the rehearsal: a number, or ``max``.
-    redo : tuple of str
+    redo : sequence of str
         Steps of an existing session to do again.
     """
 
@@ -80,7 +81,7 @@ class RunOptions:
     hands_free: bool = False
     rehearse: bool = False
     speed: str = "1"
-    redo: tuple[str, ...] = ()
+    redo: Sequence[str] = ()
 
     @property
     def is_rehearsal(self) -> bool:

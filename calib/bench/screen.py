@@ -16,8 +16,8 @@ from rich.table import Table
 from rich.text import Text
 
 from calib.bench import block_letters
+from calib.messages import english, message, verbatim
 from calib.procedure.events import Phase, View
-from calib.procedure.messages import english, message, verbatim
 from imudrv.diagnosis import LineState
 
 NO_DATA: Final = message("no_data")
@@ -280,7 +280,7 @@ def _figures(view: View, width: int, ascii_only: bool) -> RenderableType:
         "green" if view.stillness > 0.8 else "red",
         "" if view.stillness > 0.8 else "moving",
     )
-    add("progress", view.progress, "yellow", _percent(view.progress))
+    add("progress", view.progress, "yellow", "" if view.progress is None else f"{view.progress:.0%}")
     sigmas = [
         f"{name} {sigma:.4f} deg"
         for name, sigma in (("level", view.level_sigma_deg), ("heading", view.heading_sigma_deg))
@@ -288,10 +288,6 @@ def _figures(view: View, width: int, ascii_only: bool) -> RenderableType:
     ]
     table.add_row("1 sigma", ", ".join(sigmas), "")
     return table
-
-
-def _percent(part: float | None) -> str:
-    return "" if part is None else f"{part:.0%}"
 
 
 def _bar(part: float | None, width: int, style: str, ascii_only: bool) -> Text:

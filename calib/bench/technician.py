@@ -15,12 +15,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation as Attitude
 
 from calib.axes import side
+from calib.certificate import sensing_points
 from calib.procedure.plan import TURN_S
 from calib.procedure.preflight import PREFLIGHT_S
 from calib.procedure.prompts import READY_S
 from calib.procedure.schema import Procedure, Step
 from imudrv.arrays import Array
-from imudrv.calibration import Calibration, SensingPoints, SizeEffect
+from imudrv.calibration import Calibration, SizeEffect
 from imudrv.errors import InputError
 from imudrv.nav.attitude import rotation
 from imudrv.sim.path import start_attitude
@@ -83,7 +84,6 @@ def technician_scenario(
     mistakes: Sequence[Mistake] = (),
     *,
     seed: int = 1,
-    site: Site = BENCH,
     calibration: Calibration | None = None,
 ) -> Scenario:
     """Return the scenario of a procedure carried out by hand.
@@ -96,8 +96,6 @@ def technician_scenario(
         At most one per step; the step is repeated after it.
     seed : int
         Random seed of the unit's errors, its lever arms, and the technician's hands.
-    site : Site
-        Site of the bench.
     calibration : Calibration, optional
         Certificate of the unit; its `size_effect` is the truth. Default: `true_calibration` of the seed.
 
@@ -128,7 +126,7 @@ def technician_scenario(
         format="imu50-scenario",
         version=1,
         seed=seed,
-        site=site,
+        site=BENCH,
         start=hands.start,
         motion=tuple(hands.motion),
         unit=Unit(
@@ -156,8 +154,7 @@ def _draw_lever_arms(rng: np.random.Generator) -> Calibration:
     """Draw the nominal unit's lever arms, in gauge centroid."""
     r_mm = np.round(rng.normal(0.0, ARM_MM, (3, 3)), 3)
     r_mm[2] = -r_mm[0] - r_mm[1]
-    x, y, z = (tuple(row) for row in np.round(r_mm, 3).tolist())
-    size_effect = SizeEffect(r_mm=SensingPoints(x=x, y=y, z=z), gauge="centroid")
+    size_effect = SizeEffect(r_mm=sensing_points(np.round(r_mm, 3)), gauge="centroid")
     return NOMINAL.model_copy(update={"serial_number": "rehearsal", "size_effect": size_effect})
 
 

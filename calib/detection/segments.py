@@ -51,8 +51,8 @@ LEAST_FORCE: Final = 300.0 * UG
 
 
 @dataclass(frozen=True)
-class Rest:
-    """An interval at rest.
+class Interval:
+    """An interval of a capture.
 
     Attributes
     ----------
@@ -60,14 +60,6 @@ class Rest:
         Counter of the first sample, and of the first after the last.
     start_s, stop_s : float
         Time from the beginning of the capture, by the counter.
-    up : str
-        Body axis that points up, '+X' to '-Z'.
-    up_b : ndarray, shape (3,)
-        Unit vector up, body axes.
-    f_b : ndarray, shape (3,)
-        Mean specific force, m/s^2.
-    differences : SecondDifferences or None
-        For the noise; None: the rest is too short.
     missing : int
         Number of missing samples.
     """
@@ -76,16 +68,7 @@ class Rest:
     stop: int
     start_s: float
     stop_s: float
-    up: str
-    up_b: Array
-    f_b: Array
-    differences: SecondDifferences | None
     missing: int
-
-    @property
-    def noise(self) -> Noise | None:
-        """Noise of this rest, or None if it is too short."""
-        return pooled_noise([self.differences]) if self.differences else None
 
     @property
     def duration_s(self) -> float:
@@ -94,15 +77,35 @@ class Rest:
 
 
 @dataclass(frozen=True)
-class Rotation:
+class Rest(Interval):
+    """An interval at rest.
+
+    Attributes
+    ----------
+    up : str
+        Body axis that points up, '+X' to '-Z'.
+    up_b : ndarray, shape (3,)
+        Unit vector up, body axes.
+    differences : SecondDifferences or None
+        For the noise; None: the rest is too short.
+    """
+
+    up: str
+    up_b: Array
+    differences: SecondDifferences | None
+
+    @property
+    def noise(self) -> Noise | None:
+        """Noise of this rest, or None if it is too short."""
+        return pooled_noise([self.differences]) if self.differences else None
+
+
+@dataclass(frozen=True)
+class Rotation(Interval):
     """A motion between two rests; `calib.detection.acceptance.assess` accepts or rejects it.
 
     Attributes
     ----------
-    start, stop : int
-        Counter of the first sample, and of the first after the last.
-    start_s, stop_s : float
-        Time from the beginning of the capture, by the counter.
     before, after : Rest or None
         The rests before and after it; None: the capture begins or ends in motion.
     angle_deg : float
@@ -115,16 +118,10 @@ class Rotation:
         Angle between the rotation axis and the vertical, 0 to 90.
     peak_deg_per_s : float
         Largest rate of a block.
-    missing : int
-        Number of missing samples.
     flags : int
         `Flag` bits of any sample.
     """
 
-    start: int
-    stop: int
-    start_s: float
-    stop_s: float
     before: Rest | None
     after: Rest | None
     angle_deg: float
@@ -132,13 +129,7 @@ class Rotation:
     about: str
     axis_tilt_deg: float
     peak_deg_per_s: float
-    missing: int
     flags: int
-
-    @property
-    def duration_s(self) -> float:
-        """Length, s."""
-        return self.stop_s - self.start_s
 
 
 @dataclass(frozen=True)
@@ -147,8 +138,6 @@ class Segments:
 
     Attributes
     ----------
-    first : int
-        Counter of the first sample.
     interval_s : float
         Sample interval.
     duration_s : float
@@ -159,7 +148,6 @@ class Segments:
         Every motion, in order.
     """
 
-    first: int
     interval_s: float
     duration_s: float
     rests: tuple[Rest, ...]
@@ -269,6 +257,13 @@ class _Blocks(NamedTuple):
     end: int  # counter after the last sample
     interval_s: float
 
+    def interval(self, begin: int, stop: int) -> Interval:
+        """Return the interval of the blocks from `begin` to `stop`."""
+        first, end = self.counter(begin), self.counter(stop)
+        covered = round(float(self.rows["interval_ns"][begin:stop].sum()) * NS / self.interval_s)
+        missing = end - first - covered  # a long interval covers samples that were missing
+        return Interval(first, end, self.seconds(begin), self.seconds(stop), missing)
+
     def counter(self, block: int) -> int:
         """Return the counter at a block's beginning."""
         if block == len(self.rows):
@@ -279,11 +274,6 @@ class _Blocks(NamedTuple):
         """Return the time at a block's beginning, s."""
         return (self.counter(block) - self.first) * self.interval_s
 
-    def missing(self, begin: int, stop: int) -> int:
-        """Return the number of missing samples, except those that a long interval covers."""
-        covered = round(float(self.rows["interval_ns"][begin:stop].sum()) * NS / self.interval_s)
-        return self.counter(stop) - self.counter(begin) - covered
-
 
 def _segments(blocks: _Blocks) -> Segments:
     """Divide a capture into rests and rotations."""
@@ -293,7 +283,6 @@ def _segments(blocks: _Blocks) -> Segments:
     before = {stop: rest for (_, stop), rest in zip(still, rests, strict=True)}
     after = {begin: rest for (begin, _), rest in zip(still, rests, strict=True)}
     return Segments(
-        blocks.first,
         blocks.interval_s,
         (blocks.end - blocks.first) * blocks.interval_s,
         tuple(rests),
@@ -344,15 +333,10 @@ def _rest(blocks: _Blocks, begin: int, stop: int) -> Rest:
     rows = blocks.rows[begin:stop]
     f_b = rows["dv_b"].sum(axis=0) / (rows["interval_ns"].sum() * NS)
     return Rest(
-        blocks.counter(begin),
-        blocks.counter(stop),
-        blocks.seconds(begin),
-        blocks.seconds(stop),
+        **vars(blocks.interval(begin, stop)),
         up=axis_name(f_b),
         up_b=f_b / np.linalg.norm(f_b),
-        f_b=f_b,
         differences=_second_differences(rows, round(BIN_S / (blocks.size * blocks.interval_s)), f_b),
-        missing=blocks.missing(begin, stop),
     )
 
 
@@ -400,18 +384,14 @@ def _rotation(blocks: _Blocks, begin: int, stop: int, before: Rest | None, after
     total = dtheta.sum(axis=0)
     size = float(np.linalg.norm(total)) or 1.0
     return Rotation(
-        blocks.counter(begin),
-        blocks.counter(stop),
-        blocks.seconds(begin),
-        blocks.seconds(stop),
-        before,
-        after,
+        **vars(blocks.interval(begin, stop)),
+        before=before,
+        after=after,
         angle_deg=float((dtheta * up_b).sum()) / DEG,
         axis=axis_name(up),
         about=axis_name(total)[1],
         axis_tilt_deg=acos(min(1.0, abs(float(total @ up)) / size)) / DEG,
         peak_deg_per_s=float(np.linalg.norm(dtheta / dt, axis=1).max()) / DEG,
-        missing=blocks.missing(begin, stop),
         flags=int(np.bitwise_or.reduce(rows["flags"])),
     )
 

@@ -77,9 +77,7 @@ class LeverArms:
         return html_table(f"Lever arms, gauge {self.gauge}", ("mm", "X", "Y", "Z"), rows)
 
 
-def convert(
-    arms: LeverArms, to: Gauge, known_point: tuple[Literal["x", "y", "z"], ArrayLike] | None = None
-) -> LeverArms:
+def convert(arms: LeverArms, to: Gauge, known_point: tuple[str, ArrayLike] | None = None) -> LeverArms:
     """Convert lever arms to another gauge.
 
     Parameters

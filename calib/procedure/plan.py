@@ -9,7 +9,6 @@ from typing import Final
 from calib.axes import opposite
 from calib.detection.noise import Noise
 from calib.estimation.predict import PlannedRotation, Prediction, predict
-from calib.estimation.runs import Priors
 from calib.procedure.schema import VERIFICATION, Pose, Procedure, Step
 from imudrv.errors import InputError
 from imudrv.files.settings_file import SettingsFile, read_file
@@ -26,14 +25,8 @@ TYPICAL_NOISE: Final = Noise(
 """Noise of a unit that was not measured yet; the beat of its pulses makes it quieter in some poses."""
 
 
-def predicted(
-    procedure: Procedure,
-    site: Site,
-    noise: Noise | None = None,
-    priors: Priors | None = None,
-    skipped: Collection[str] = (),
-) -> Prediction:
-    """Predict the accuracy of a procedure.
+def predicted(procedure: Procedure, site: Site, skipped: Collection[str] = ()) -> Prediction:
+    """Predict the accuracy of a procedure with a unit of `TYPICAL_NOISE`.
 
     Parameters
     ----------
@@ -41,10 +34,6 @@ def predicted(
         The plan.
     site : Site
         Location of the unit.
-    noise : Noise, optional
-        Noise of the sensors; `TYPICAL_NOISE` where it was not measured yet.
-    priors : Priors, optional
-        Residual errors of the static calibration.
     skipped : collection of str
         Ids of skipped steps.
 
@@ -64,7 +53,7 @@ def predicted(
         if step.id not in skipped
     ]
     try:
-        return predict(plan, site.latitude_rad, noise or TYPICAL_NOISE, priors)
+        return predict(plan, site.latitude_rad, TYPICAL_NOISE)
     except InputError as error:
         raise InputError(f"procedure {procedure.name}: {error}") from error
 

@@ -19,8 +19,8 @@ from realtime import DEADLINE_S
 from rich.console import Console
 
 from calib.bench.entries import Plan, from_json
-from calib.bench.evidence import identify, identify_session
 from calib.bench.journal import Journal, begin
+from calib.bench.result import identify, identify_session
 from calib.bench.run import RunOptions, run
 from calib.bench.session import Session
 from calib.bench.simulated_unit import SEED
@@ -218,7 +218,7 @@ def test_velocity_and_h_of_every_sample_of_every_run_are_logged_once(undisturbed
         newest = int(counter[-1])
 
 
-def test_the_result_is_recomputed_and_a_flipped_bit_in_the_evidence_is_named(
+def test_the_result_is_recomputed_and_a_flipped_bit_in_a_recording_is_reported(
     undisturbed: tuple[Path, str],
 ) -> None:
     folder, _ = undisturbed
@@ -399,7 +399,7 @@ def check_true(folder: Path) -> None:
 
 
 def check_resumed(folder: Path) -> None:
-    """No accepted step was repeated, no sample logged twice, all evidence is complete."""
+    """No accepted step was repeated, no sample logged twice, all recordings are complete."""
     done: list[str] = []
     logged: set[str] = set()
     for entry in journal(folder):
@@ -426,7 +426,9 @@ def test_keys_need_a_terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
             run(RunOptions(tmp_path / "new"), Console())
 
 
-def test_a_rehearsal_takes_no_unit_and_a_session_of_a_unit_no_rehearsal(tmp_path: Path) -> None:
+def test_a_rehearsal_with_a_port_is_refused_and_so_is_rehearsing_the_session_of_a_unit(
+    tmp_path: Path,
+) -> None:
     with pytest.raises(InputError, match="--rehearse: expected no --port"):
         run(RunOptions(tmp_path / "new", rehearse=True, port="/dev/ttyUSB0"), Console())
     (tmp_path / JOURNAL).touch()

@@ -25,15 +25,15 @@ from calib.bench.entries import (
     UnitDetected,
     to_json,
 )
-from calib.bench.evidence import Result
 from calib.bench.keys import Keyboard
 from calib.bench.queue_sink import QueueSink
+from calib.bench.result import Result
 from calib.bench.screen import OperatorScreen, plain
 from calib.bench.session import Session
 from calib.bench.technician import BENCH, Mistake, technician_scenario
 from calib.bench.verify import verify
+from calib.messages import english
 from calib.procedure.events import Accepted, Entered, Phase, Rejected, View
-from calib.procedure.messages import english
 from calib.procedure.plan import steps_left
 from calib.procedure.schema import Procedure
 from imudrv import profiles
@@ -290,7 +290,7 @@ def test_messages_of_the_service_about_the_port_are_shown_and_journaled(
     assert "!" not in text.splitlines()[-1]
 
 
-def test_a_mistake_is_journaled_with_its_reasons_and_its_evidence_kept(session: Session) -> None:
+def test_a_mistake_is_journaled_with_its_reasons_and_its_recording_is_kept(session: Session) -> None:
     scenario = technician_scenario(PROCEDURE, [Mistake("z-up", "short")], calibration=NOMINAL)
     _, text = conducted(session, performed(scenario))
     rejection = rejected(session)
@@ -357,7 +357,7 @@ def test_a_key_refers_to_the_view_that_the_operator_sees(
     assert phases(session, Phase.SETTLE) == []
 
 
-def test_evidence_is_complete_even_if_the_worker_is_late_by_a_whole_step(
+def test_recordings_are_complete_even_if_the_worker_is_late_by_a_whole_step(
     session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     done = technician_scenario(PROCEDURE, calibration=NOMINAL)

@@ -56,7 +56,7 @@ def test_the_differences_and_their_covariance_are_the_same_in_every_gauge(to: Ga
     assert np.linalg.matrix_rank(there.covariance) == 6
 
 
-def test_the_origin_is_where_the_gauge_says() -> None:
+def test_each_gauge_has_its_origin() -> None:
     np.testing.assert_allclose(arms().r_b.sum(axis=0), 0.0, atol=1e-16)
     for k, to in enumerate(GAUGES[1:4]):
         there = convert(arms(), to)

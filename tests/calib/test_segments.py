@@ -5,14 +5,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.detection.acceptance import RotationLimits, expected_error_mm, rejection_reasons
+from calib.detection import acceptance
+from calib.detection.acceptance import RotationLimits, expected_error_mm
 from calib.detection.segments import Rotation, Segments, find_segments
+from calib.messages import english
 from imudrv.errors import InputError
 from imudrv.records import Flag, Records
 
 Bench = Callable[..., Records]
 Step = Callable[..., Any]
 LIMITS = RotationLimits()
+
+
+def rejection_reasons(rotation: Rotation, limits: RotationLimits, **more: Any) -> tuple[str, ...]:
+    """English reasons."""
+    return tuple(map(english, acceptance.rejection_reasons(rotation, limits, **more)))
 
 
 def only(segments: Segments) -> Rotation:
@@ -223,7 +230,7 @@ def test_a_short_last_block_is_no_motion(bench: Bench, step: Step, samples: int)
     rows["dtheta_b"][-1] += 1e-5  # a pulse of two arcsec alone in a few samples
     found = find_segments([rows])
     assert len(found.rotations) == 1
-    assert found.rests[-1].stop - found.first == 20_000
+    assert found.rests[-1].stop - found.rests[0].start == 20_000
 
 
 def test_no_error_is_extrapolated_for_what_is_no_turn(bench: Bench, step: Step) -> None:

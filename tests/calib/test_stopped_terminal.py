@@ -55,7 +55,7 @@ def journal(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text().split("\n")[:-1]] if path.exists() else []
 
 
-def test_a_terminal_that_accepts_no_output_for_a_whole_step_costs_no_evidence(tmp_path: Path) -> None:
+def test_a_terminal_that_accepts_no_output_for_a_whole_step_costs_no_data(tmp_path: Path) -> None:
     procedure, folder, terminal = tmp_path / "short.yaml", tmp_path / "session", Terminal()
     procedure.write_text(PROCEDURE)
     command = ["run", "--rehearse", "--speed", str(SPEED), "--procedure", str(procedure)]

@@ -5,8 +5,6 @@ attempt.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
-from datetime import UTC, datetime
 from itertools import islice
 from typing import Final, NamedTuple
 
@@ -18,32 +16,26 @@ from calib.bench.state import Attempt, SessionState
 from calib.certificate import certificate
 from calib.detection.blocks import BLOCK_NS
 from calib.estimation.joint import estimate_joint
-from calib.estimation.runs import CaptureRuns, NavigationOptions, Priors, Run, navigate_rotations
+from calib.estimation.linear_system import velocity_gain
+from calib.estimation.runs import CaptureRuns, NavigationOptions, Priors, navigate_capture
 from calib.identification import (
     CaptureSummary,
     IdentificationResult,
     PriorCalibration,
-    Temperature,
-    software,
+    temperature_ranges,
 )
+from calib.messages import english
+from calib.procedure.plan import verification
 from calib.procedure.schema import VERIFICATION, Procedure
-from imudrv.calibration import Calibration, coefficients
+from imudrv.calibration import Calibration
 from imudrv.errors import InputError
 from imudrv.files import atomic
-from imudrv.imu.coefficients import Coefficients
-from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import rate_filter
 from imudrv.imu.sequence import SampleCounts, SequenceTracker
 from imudrv.recording.reader import Recording
 from imudrv.records import Records
 from imudrv.site import Site
-from imudrv.units import NS
 from imudrv.wire.decoder import FrameDecoder
 from imudrv.wire.layout import Layout
-
-RESIDUAL_WINDOW_S: Final = 0.5
-"""Averaging window for the velocity before and after a rotation, s."""
-
 
 _PUBLISHED_PERIOD: Final = 1 << 32
 """Period of the counter of published increments."""
@@ -58,23 +50,23 @@ class Result(NamedTuple):
 
     Attributes
     ----------
-    findings : IdentificationResult
+    identification : IdentificationResult
         The identification.
     certificate : Calibration
         The unit's new certificate.
     """
 
-    findings: IdentificationResult
+    identification: IdentificationResult
     certificate: Calibration
 
 
-class _DecodedRecording(NamedTuple):
-    """Decoded evidence of an attempt.
+class DecodedRecording(NamedTuple):
+    """Decoded samples of an attempt.
 
     Attributes
     ----------
     pulses : Records
-        Samples of the evidence.
+        Pulses.
     counter : ndarray of int64
         Their counters, in the service's count.
     layout : Layout
@@ -98,7 +90,7 @@ def identify_session(session: SessionState) -> Result:
 
 
 def identify(
-    procedure: Procedure, attempts: Sequence[Attempt], basis: PriorCalibration, site: Site
+    procedure: Procedure, attempts: Sequence[Attempt], prior_calibration: PriorCalibration, site: Site
 ) -> Result:
     """Identify the lever arms.
 
@@ -108,7 +100,7 @@ def identify(
         The procedure that was carried out.
     attempts : sequence of Attempt
         The accepted attempts.
-    basis : PriorCalibration
+    prior_calibration : PriorCalibration
         The certificate before; its size effect is not used.
     site : Site
         Site of the bench.
@@ -122,20 +114,12 @@ def identify(
     InputError
         A recording cannot be read or lacks its rotation, or `estimate_joint` refuses.
     """
-    priors = Priors()
-    known = replace(coefficients(basis.calibration), r_b=None)
-    sources = tuple(_summarise(procedure, attempt, known, site, priors) for attempt in attempts)
-    findings = IdentificationResult(
-        estimate_joint([run for source in sources for run in source.evidence.runs], priors),
-        basis,
-        site,
-        procedure.rotation_limits(procedure.steps[0]),
-        priors,
-        sources,
-        datetime.now(UTC).replace(microsecond=0),
-        software(),
-    )
-    return Result(findings, certificate(findings, findings.arms))
+    priors, bare = Priors(), prior_calibration.calibration.without_size_effect()
+    sources = tuple(_summarise(procedure, attempt, bare, site) for attempt in attempts)
+    result = estimate_joint([run for source in sources for run in source.rotations.runs], priors)
+    limits = procedure.rotation_limits(procedure.steps[0])
+    identification = IdentificationResult(result, prior_calibration, site, limits, priors, sources)
+    return Result(identification, certificate(identification, identification.arms))
 
 
 def uncovered(attempt: Attempt) -> str:
@@ -159,37 +143,15 @@ def uncovered(attempt: Attempt) -> str:
     return _missing(attempt, _decode(attempt))
 
 
-def require_covered(attempt: Attempt) -> None:
-    """Refuse an attempt whose recording lacks samples.
+def residual_velocity(session: SessionState, calibration: Calibration) -> ResidualVelocity:
+    """Return the velocity after the verification rotation, without and with compensation.
 
     Parameters
     ----------
-    attempt : Attempt
-        An accepted attempt.
-
-    Raises
-    ------
-    InputError
-        Samples are missing, or the recording cannot be read; the message says which and what to do.
-    """
-    _decode_covered(attempt)
-
-
-def residual_velocity(
-    procedure: Procedure, attempt: Attempt, calibration: Calibration, site: Site
-) -> ResidualVelocity:
-    """Return the residual velocity after a rotation, without and with compensation.
-
-    Parameters
-    ----------
-    procedure : Procedure
-        Procedure with the attempt's step.
-    attempt : Attempt
-        An accepted attempt.
+    session : SessionState
+        A session whose verification is accepted.
     calibration : Calibration
         Certificate with its size effect.
-    site : Site
-        Site of the bench.
 
     Returns
     -------
@@ -200,72 +162,67 @@ def residual_velocity(
     InputError
         The recording cannot be read or lacks its rotation.
     """
-    known, decoded = coefficients(calibration), _decode_covered(attempt)
-    rows = round(RESIDUAL_WINDOW_S / (BLOCK_NS * NS))
+    procedure, attempt = verification(session.procedure()), session.attempts()[VERIFICATION]
+    decoded = decode_covered(attempt)
     residual = []
-    for c in (replace(known, r_b=None), known):
-        run = _navigate(procedure, attempt, decoded, c, site, Priors()).runs[0]
-        gained = _mean(run, run.after, slice(rows)) - _mean(run, run.before, slice(-rows, None))
-        residual.append(float(np.hypot(gained[0], gained[1])))
+    for used in (calibration.without_size_effect(), calibration):
+        run = _navigate(procedure, attempt, decoded, used, session.site()).runs[0]
+        V, _ = velocity_gain(run)
+        residual.append(float(np.hypot(V[0], V[1])))
     return ResidualVelocity(*residual)
 
 
-def _mean(run: Run, rest: np.ndarray, rows: slice) -> np.ndarray:
-    mean: np.ndarray = run.v_n[rest][rows].mean(axis=0)
-    return mean
-
-
 def _summarise(
-    procedure: Procedure, attempt: Attempt, known: Coefficients, site: Site, priors: Priors
+    procedure: Procedure, attempt: Attempt, calibration: Calibration, site: Site
 ) -> CaptureSummary:
     with atomic.unchanged(attempt.recording):
-        decoded = _decode_covered(attempt)
+        decoded = decode_covered(attempt)
         digest = atomic.sha256(attempt.recording)
-    degc = decoded.pulses["temperature_degc"]
+    layout, degc = decoded.layout, decoded.pulses["temperature_degc"]
     return CaptureSummary(
         attempt.recording.stem,
         attempt.recording.name,
         digest,
-        decoded.layout.name,
+        layout.name,
         str(decoded.counts),
-        tuple(
-            Temperature(name, float(t.min()), float(t.max()))
-            for name, column in zip(decoded.layout.temperature_names, degc.T, strict=False)
-            if (t := column[~np.isnan(column)]).size
-        ),
-        _navigate(procedure, attempt, decoded, known, site, priors),
+        temperature_ranges(layout.temperature_names, np.fmin.reduce(degc), np.fmax.reduce(degc)),
+        _navigate(procedure, attempt, decoded, calibration, site),
     )
 
 
 def _navigate(
     procedure: Procedure,
     attempt: Attempt,
-    decoded: _DecodedRecording,
-    known: Coefficients,
+    decoded: DecodedRecording,
+    calibration: Calibration,
     site: Site,
-    priors: Priors,
 ) -> CaptureRuns:
-    layout = decoded.layout
-    compensator = Compensator(known, layout, rate_filter("causal", layout.interval_ns))
-    increments = [compensator.feed(decoded.pulses), compensator.close()]
-    evidence = navigate_rotations(
-        lambda: increments,
-        known.C_ba,
+    limits = procedure.rotation_limits(attempt.step)
+    navigated = navigate_capture(
+        lambda: [decoded.pulses],
+        decoded.layout,
+        calibration,
         site,
         attempt.recording.stem,
-        NavigationOptions(procedure.rotation_limits(attempt.step), priors, expected=attempt.step.up[1]),
+        NavigationOptions(limits, expected=attempt.step.up[1]),
     )
-    if len(evidence.runs) != 1:
-        reasons = "; ".join(reason for _, reasons in evidence.rejected for reason in reasons) or "no motion"
+    if len(navigated.runs) != 1:
+        reasons = "; ".join(english(reason) for _, reasons in navigated.rejected for reason in reasons)
         raise InputError(
-            f"{attempt.recording}: expected the one rotation that was accepted, got {len(evidence.runs)}: "
-            f"{reasons}"
+            f"{attempt.recording}: expected the one rotation that was accepted, got {len(navigated.runs)}: "
+            f"{reasons or 'no motion'}"
         )
-    return evidence
+    return navigated
 
 
-def _decode_covered(attempt: Attempt) -> _DecodedRecording:
-    """Decode a recording and cut it to the evidence, which must be complete."""
+def decode_covered(attempt: Attempt) -> DecodedRecording:
+    """Decode a recording and cut it to the samples of the attempt.
+
+    Raises
+    ------
+    InputError
+        Samples are missing, or the recording cannot be read; the message says which and what to do.
+    """
     decoded = _decode(attempt)
     if lacks := _missing(attempt, decoded):
         step, folder = attempt.step.id, attempt.recording.parent
@@ -276,8 +233,8 @@ def _decode_covered(attempt: Attempt) -> _DecodedRecording:
     return decoded
 
 
-def _decode(attempt: Attempt) -> _DecodedRecording:
-    """Decode a recording and cut it to the evidence that it contains."""
+def _decode(attempt: Attempt) -> DecodedRecording:
+    """Decode a recording and cut it to those samples of the attempt that it contains."""
     recording = Recording(attempt.recording)
     layout = recording.profile.layout()
     decoder, tracker = FrameDecoder(layout), SequenceTracker(layout)
@@ -285,13 +242,13 @@ def _decode(attempt: Attempt) -> _DecodedRecording:
     pulses.append(tracker.feed(decoder.close()))
     samples = np.concatenate(pulses)
     counter = samples["counter"]
-    backward = np.flatnonzero(np.diff(counter) <= 0)  # the unit restarted before the evidence
+    backward = np.flatnonzero(np.diff(counter) <= 0)  # the unit restarted before the attempt
     begin = int(backward[-1]) + 1 if len(backward) else 0
     counter = counter[begin:]
     if len(counter) and not begin:  # at a restart the service, too, begins with the unit's own number
         counter = counter + _offset(recording, attempt, int(counter[0]), 1 << layout.sequence.bits)
     first, stop = np.searchsorted(counter, [attempt.first_counter, attempt.last_counter + 1])
-    return _DecodedRecording(
+    return DecodedRecording(
         samples[begin + first : begin + stop], counter[first:stop], layout, tracker.counts
     )
 
@@ -308,8 +265,8 @@ def _multiple(difference: int, period: int) -> int:
     return (2 * difference + period) // (2 * period) * period
 
 
-def _missing(attempt: Attempt, decoded: _DecodedRecording) -> str:
-    """Describe the longest gap in the evidence, unless the line lost these samples.
+def _missing(attempt: Attempt, decoded: DecodedRecording) -> str:
+    """Describe the longest gap in the attempt, unless the line lost these samples.
 
     If the number of samples is unknown, gaps of up to a block of 20 ms are attributed to the line: the engine
     accepts no longer ones.
