@@ -42,7 +42,10 @@ def run_program(
     int
         Exit code, see `guarded`.
     """
-    arguments = sys.argv[1:] if argv is None else argv
+    return guarded(lambda: _run(package, description, commands, sys.argv[1:] if argv is None else argv))
+
+
+def _run(package: str, description: str, commands: Mapping[str, str], arguments: Sequence[str]) -> int | None:
     name = next((argument for argument in arguments if not argument.startswith("-")), None)
     program = package.partition(".")[0]
     parser = argparse.ArgumentParser(
@@ -58,7 +61,8 @@ def run_program(
             subparser.epilog = f"example: {program} {command} {module.EXAMPLE}".rstrip()
             module.add_arguments(subparser)
     parsed = parser.parse_args(arguments)
-    return guarded(lambda: module.run(parsed) if module else None)
+    code: int | None = module.run(parsed) if module else None
+    return code
 
 
 class _Version(argparse.Action):
@@ -82,11 +86,12 @@ def guarded(command: Callable[[], int | None]) -> int:
     Returns
     -------
     int
-        The command's exit code, 0 if it has none; 2 for an error of the user; 130 after Ctrl-C; 1 for a
-        defect of this product, reported with its place in the code.
+        The command's exit code, 0 if it has none or stops because nobody reads its output; 2 for an error
+        of the user; 130 after Ctrl-C; 1 for a defect of this product, reported with its place in the code.
     """
+    code = OK
     try:
-        code = command()
+        code = command() or OK
         if sys.stdout is not None:  # None: the process was started with it closed
             sys.stdout.flush()
     except InputError as error:
@@ -98,14 +103,13 @@ def guarded(command: Callable[[], int | None]) -> int:
     except BrokenPipeError:
         # The reader of the output has gone, as `head` does; Python must not flush it again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return OK
     except Exception as error:
         from traceback import format_tb
 
         place = "".join(format_tb(error.__traceback__)[-2:])
         _complain(f"internal error, please report it: {type(error).__name__}: {error}\n{place}")
         return OUR_FAULT
-    return code or OK
+    return code
 
 
 def _complain(text: str) -> None:
