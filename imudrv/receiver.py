@@ -9,11 +9,8 @@ print(receiver.counts)
 import os
 import select
 import socket
-from collections.abc import Callable
-from functools import partial
 from types import TracebackType
 from typing import Final, Self
-from urllib.parse import urlsplit
 
 import numpy as np
 import serial
@@ -22,14 +19,13 @@ from imudrv.errors import InputError
 from imudrv.imu.sequence import SampleCounts, SequenceTracker
 from imudrv.ports.base import PortLostError
 from imudrv.ports.serial import explain
-from imudrv.ports.url import Url, split
+from imudrv.profiles.schema import SerialLine
 from imudrv.records import FRAME, Records
 from imudrv.sinks.serial import BAUDRATE
+from imudrv.url import LOOPBACK, Url, device_path, host_and_port, serial_settings, split
 from imudrv.wire.datagram import DatagramDecoder
 from imudrv.wire.layout import Layout
 
-_EXPECTED: Final = "udp://[HOST]:PORT, tcp://HOST:PORT or serial:///dev/ttyUSB0?baudrate=921600"
-_LOOPBACK: Final = "127.0.0.1"
 _AT_ONCE: Final = 1 << 16
 _QUEUE: Final = 1 << 22  # the system's default holds a quarter of a second of single samples
 _CONNECT_S: Final = 5.0
@@ -72,14 +68,9 @@ class Receiver:
         self._decoder = DatagramDecoder()
         self._tracker = SequenceTracker(_COUNTED)
         self._ordered(b"")  # compiles the kernels before samples arrive
-        self._device = _open(split(url))
+        self._device = _open(split(url, ("udp", "tcp", "serial")))
         self._is_packets = isinstance(self._device, socket.socket) and (
             self._device.type == socket.SOCK_DGRAM
-        )
-        self._read: Callable[[int], bytes] = (
-            self._device.recv
-            if isinstance(self._device, socket.socket)
-            else partial(os.read, self._device.fileno())
         )
         self._is_open = True
 
@@ -106,7 +97,7 @@ class Receiver:
         """
         while self._is_open and select.select([self._device.fileno()], (), (), self._timeout_s)[0]:
             try:
-                data = self._read(_AT_ONCE)
+                data = os.read(self._device.fileno(), _AT_ONCE)
             except OSError:
                 data = b""
                 self.close()
@@ -169,15 +160,7 @@ def receive(url: str, timeout_s: float | None = None) -> Receiver:
 def _open(url: Url) -> socket.socket | serial.Serial:
     if url.scheme == "serial":
         return _open_line(url)
-    if url.scheme not in ("udp", "tcp"):
-        raise InputError(f"{url.text}: expected {_EXPECTED}, got {url.scheme}://")
-    try:
-        parts = urlsplit(f"//{url.address}")
-        host, port = parts.hostname or _LOOPBACK, parts.port
-    except ValueError:
-        port = None
-    if port is None or parts.path or url.options:
-        raise InputError(f"{url.text}: expected {url.scheme}://HOST:PORT")
+    host, port = host_and_port(url, LOOPBACK)
     try:
         if url.scheme == "tcp":
             return socket.create_connection((host, port), _CONNECT_S)
@@ -200,12 +183,10 @@ def _listen(host: str, port: int) -> socket.socket:
 
 
 def _open_line(url: Url) -> serial.Serial:
-    baudrate = url.options.get("baudrate", str(BAUDRATE))
-    if not url.address or url.options.keys() - {"baudrate"} or not baudrate.isdecimal():
-        raise InputError(f"{url.text}: expected {_EXPECTED}")
+    path, settings = device_path(url), serial_settings(url, SerialLine(baudrate=BAUDRATE))
     try:
-        return serial.Serial(url.address, int(baudrate), timeout=0, exclusive=True)
+        return serial.Serial(path, **settings, timeout=0, exclusive=True)
     except ValueError as error:
         raise InputError(f"{url.text}: {error}") from error
     except serial.SerialException as error:
-        raise PortLostError(f"{url.text}: {explain(url.address, error)}") from error
+        raise PortLostError(f"{url.text}: {explain(path, error)}") from error

@@ -16,7 +16,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from imudrv.errors import InputError
 from imudrv.profiles.schema import Profile
 from imudrv.records import Records
 from imudrv.sim.capture import WireChunk, wire
@@ -264,34 +263,6 @@ def play(
         "messages" if layout.can else "bytes",
         None if speed is None else latest_ns,
     )
-
-
-def speed_of(text: str) -> float | None:
-    """Return the speed that a text means: ``1``, ``0.5``, ``10``; ``max`` is None.
-
-    Parameters
-    ----------
-    text : str
-        Text as the user gave it.
-
-    Returns
-    -------
-    float or None
-
-    Raises
-    ------
-    InputError
-        The text is not a speed.
-    """
-    if text == "max":
-        return None
-    try:
-        speed = float(text)
-    except ValueError:
-        speed = 0.0
-    if not 0.001 <= speed <= 1000.0:
-        raise InputError(f"speed: expected max or a number from 0.001 to 1000, got {text!r}")
-    return speed
 
 
 def _ahead(chunks: Iterator[WireChunk]) -> Generator[WireChunk, None, None]:

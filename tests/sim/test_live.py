@@ -26,8 +26,9 @@ from imudrv.files import settings_file
 from imudrv.records import Records
 from imudrv.sim.capture import wire
 from imudrv.sim.links import pty, tcp
-from imudrv.sim.live import MOST, Pace, PacedPlayback, Played, play, speed_of
+from imudrv.sim.live import MOST, Pace, PacedPlayback, Played, play
 from imudrv.sim.scenario import Scenario
+from imudrv.url import speed_of
 
 Make = Callable[..., Scenario]
 RS422 = profiles.load("imu50-rs422")
@@ -332,11 +333,11 @@ def test_a_can_bus_carries_the_messages_of_the_capture(
         ("can://virtual/x", RS422, "expected pty, a serial port or tcp:// for the profile imu50-rs422"),
         ("can://nonsense/x", CAN, "cannot be opened as a CAN bus"),
         ("/dev/no-such-port", RS422, "/dev/no-such-port: cannot be opened as a serial port"),
-        ("serial:///dev/x?colour=red", RS422, "expected pty, a serial port's path"),
+        ("serial:///dev/x?colour=red", RS422, "colour: unknown key"),
         ("serial:///dev/x?baudrate=fast", RS422, "fast"),
         ("tcp://127.0.0.1:99999", RS422, "(?i)port"),
         ("tcp://192.0.2.1:5000", RS422, "cannot listen there"),
-        ("udp://127.0.0.1:5000", RS422, "expected pty, a serial port's path"),
+        ("udp://127.0.0.1:5000", RS422, "begins with serial://, tcp://, or a path"),
     ],
 )
 def test_a_target_without_sense_is_refused(
