@@ -29,7 +29,6 @@ from imudrv.errors import InputError
 from imudrv.files import settings_file
 from imudrv.files.atomic import sha256, unchanged
 from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import rate_filter
 from imudrv.profiles.schema import Profile
 from imudrv.recording.reader import Recording
 from imudrv.records import Records
@@ -385,7 +384,7 @@ def _read(path: Path, label: str, shared: _Shared) -> CaptureSummary:
         nonlocal capture
         capture = Capture(path, shared.profile, shared.channel)
         layout = capture.layout
-        compensator = Compensator(known, layout, rate_filter("causal", layout.interval_ns))
+        compensator = Compensator(known, layout)
         for pulses in capture.pulses(shared.advance):
             if len(pulses):
                 np.fmin(low, np.fmin.reduce(pulses["temperature_degc"], axis=0), out=low)

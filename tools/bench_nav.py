@@ -19,7 +19,6 @@ from imudrv.calibration import coefficients
 from imudrv.capture import Capture
 from imudrv.files.settings_file import parse
 from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import rate_filter
 from imudrv.nav.attitude import quaternion_of_matrix
 from imudrv.nav.mechanisation import Navigator
 from imudrv.profiles import load
@@ -132,7 +131,7 @@ def _write(path: Path) -> NDArray[np.float64]:
 
 
 def _compensator() -> Compensator:
-    return Compensator(KNOWN, LAYOUT, rate_filter("causal", LAYOUT.interval_ns))
+    return Compensator(KNOWN, LAYOUT)
 
 
 def _navigator(q_nb: NDArray[np.float64], *, matrices: bool) -> Navigator:

@@ -39,7 +39,7 @@ from imudrv.calibration import Calibration, coefficients
 from imudrv.errors import InputError
 from imudrv.files import model, settings_file
 from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import NAMES, rate_filter
+from imudrv.imu.rate_filter import NAMES
 from imudrv.imu.sequence import SequenceTracker
 from imudrv.profiles.schema import Profile
 from imudrv.records import INCREMENTS, MESSAGE, PULSES, Records, Source
@@ -477,7 +477,7 @@ def use(settings: model.Model) -> None:
     elif isinstance(settings, Calibration):
         layout = SHIPPED[SERIAL[0]]
         pulses = SequenceTracker(layout).feed(StreamDecoder(layout).feed(wire(rng, layout, 9)).frames)
-        require_finite(Compensator(coefficients(settings), layout, FILTERS["causal"]).feed(pulses))
+        require_finite(Compensator(coefficients(settings), layout).feed(pulses))
     elif isinstance(settings, Profile):
         layout = settings.layout()
         decoder, tracker = (CanAssembler if layout.can else StreamDecoder)(layout), SequenceTracker(layout)
@@ -489,7 +489,6 @@ def use(settings: model.Model) -> None:
 # The whole chain
 
 COEFFICIENTS: Final = coefficients(settings_file.parse(CALIBRATION, Calibration, "a unit"))
-FILTERS: Final = {name: rate_filter(name, 1_000_000) for name in NAMES}
 
 
 def make_chain(rng: Generator) -> tuple[Setup, bytes]:
@@ -511,7 +510,7 @@ def check_chain(setup: Setup, data: bytes, cuts: Cuts) -> None:
 
     def run(parts: list[bytes]) -> list[Records]:
         decoder, tracker = CaptureDecoder(layout), SequenceTracker(layout)
-        compensator, out = Compensator(numbers, layout, FILTERS[filter_name]), []
+        compensator, out = Compensator(numbers, layout, filter_name), []
         for feed in (*(functools.partial(decoder.feed, part) for part in parts), decoder.close):
             out.append(compensator.feed(tracker.feed(feed())))
             assert tracker.counts.closes, f"{tracker.counts} does not add up"

@@ -32,7 +32,6 @@ from imudrv.errors import InputError
 from imudrv.files import atomic
 from imudrv.imu.coefficients import Coefficients
 from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import rate_filter
 from imudrv.imu.sequence import SampleCounts, SequenceTracker
 from imudrv.recording.reader import Recording
 from imudrv.records import Records
@@ -246,7 +245,7 @@ def _navigate(
     priors: Priors,
 ) -> CaptureRuns:
     layout = decoded.layout
-    compensator = Compensator(known, layout, rate_filter("causal", layout.interval_ns))
+    compensator = Compensator(known, layout)
     increments = [compensator.feed(decoded.pulses), compensator.close()]
     evidence = navigate_rotations(
         lambda: increments,

@@ -25,7 +25,6 @@ from imudrv.arrays import Array
 from imudrv.calibration import Calibration, coefficients
 from imudrv.files.settings_file import parse
 from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import rate_filter
 from imudrv.records import Flag, Records
 from imudrv.sim.scenario import NOMINAL, Residuals, Scenario, Unit
 from imudrv.sim.unit import draw_true_unit, simulate
@@ -150,7 +149,7 @@ def scenario(seed: int, calibration: Calibration, pose: str, sign: int, budget: 
 def increments(turn: Scenario) -> Records:
     """Return the increments of the nominal calibration, without size-effect compensation."""
     bare = coefficients(NOMINAL.without_size_effect())
-    compensator = Compensator(bare, LAYOUT, rate_filter("causal", LAYOUT.interval_ns))
+    compensator = Compensator(bare, LAYOUT)
     pulses = np.concatenate([chunk.pulses for chunk in simulate(turn, LAYOUT.interval_ns)])
     pulses["flags"] = Flag.VALID
     return compensator.feed(pulses)

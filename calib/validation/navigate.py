@@ -38,7 +38,6 @@ from imudrv.arrays import Array
 from imudrv.errors import InputError
 from imudrv.imu.coefficients import Coefficients
 from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import rate_filter
 from imudrv.nav.alignment import Aligned, Alignment
 from imudrv.nav.earth import normal_gravity
 from imudrv.nav.mechanisation import Navigator
@@ -133,7 +132,7 @@ class _NavigationChain:
     def __init__(self, settings: TrialSettings, known: Coefficients) -> None:
         site, layout = settings.site, settings.layout
         self._site = site
-        self._compensator = Compensator(known, layout, rate_filter(settings.rate_filter, layout.interval_ns))
+        self._compensator = Compensator(known, layout, settings.rate_filter)
         self._skew = SkewCorrection(settings, known) if settings.skew_s else None
         priors = Priors()
         self._alignment = Alignment(

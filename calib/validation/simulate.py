@@ -24,7 +24,7 @@ from imudrv import profiles
 from imudrv.arrays import Array
 from imudrv.calibration import Accelerometer, Calibration, Gyro, SensingPoints, SizeEffect, coefficients
 from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import RateFilterName, rate_filter
+from imudrv.imu.rate_filter import RateFilterName
 from imudrv.nav.alignment import ALIGNMENT_S
 from imudrv.records import Flag, Records
 from imudrv.sim import scenario as scenarios
@@ -300,7 +300,7 @@ def _simulated_runs(name: str, unit: Unit, seed: list[int], known: Calibration) 
     limits = RotationLimits() if name in PROCEDURE else ANY_MOTION
 
     def increments() -> Iterator[Records]:
-        compensator = Compensator(bare, layout, rate_filter("causal", layout.interval_ns))
+        compensator = Compensator(bare, layout)
         for pulses in captured:
             yield compensator.feed(pulses)
 

@@ -9,7 +9,6 @@ from calib.validation.trial import TrialSettings
 from imudrv.errors import InputError
 from imudrv.imu.coefficients import Coefficients
 from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import rate_filter
 from imudrv.records import Flag, Records
 from imudrv.units import NS
 
@@ -24,9 +23,7 @@ class SkewCorrection:
     def __init__(self, settings: TrialSettings, known: Coefficients) -> None:
         layout = settings.layout
         self._interval_ns = layout.interval_ns
-        self._bare = Compensator(
-            replace(known, r_b=None), layout, rate_filter(settings.rate_filter, layout.interval_ns)
-        )
+        self._bare = Compensator(replace(known, r_b=None), layout, settings.rate_filter)
         at = -settings.skew_s / (layout.interval_ns * NS)
         first = floor(at)
         u = at - first

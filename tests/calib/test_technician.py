@@ -17,7 +17,7 @@ from calib.procedure.events import Accepted, Event, Finished, Phase, Rejected, R
 from calib.procedure.messages import english
 from calib.procedure.plan import load, predicted
 from calib.procedure.schema import Procedure
-from imudrv import Coefficients, Compensator, coefficients, load_profile, rate_filter
+from imudrv import Coefficients, Compensator, coefficients, load_profile
 from imudrv.errors import InputError
 from imudrv.records import Flag, Records
 from imudrv.sim.scenario import Scenario
@@ -76,7 +76,7 @@ def samples_of(scenario: Scenario) -> Records:
     calibration = scenario.unit.calibration
     assert calibration is not None
     plain: Coefficients = coefficients(calibration.model_copy(update={"size_effect": None}))
-    compensator = Compensator(plain, LAYOUT, rate_filter("centred", LAYOUT.interval_ns))
+    compensator = Compensator(plain, LAYOUT, "centred")
     samples = np.concatenate([compensator.feed(c.pulses) for c in simulate(scenario, LAYOUT.interval_ns)])
     for unplug in scenario.faults.unplugs:
         out = (samples["t_ns"] > unplug.at_s * 1e9) & (

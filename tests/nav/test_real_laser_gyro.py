@@ -21,7 +21,6 @@ from imudrv import profiles
 from imudrv.capture import Capture
 from imudrv.imu.coefficients import Coefficients
 from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import rate_filter
 from imudrv.nav.alignment import Aligned, Alignment
 from imudrv.nav.attitude import quaternion_of_matrix
 from imudrv.nav.earth import earth_rate_n, normal_gravity
@@ -82,7 +81,7 @@ def log(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Log:
         accelerometer_bias=nothing,
         C_ba=level,
     )
-    compensator = Compensator(c, capture.layout, rate_filter("causal", capture.layout.interval_ns))
+    compensator = Compensator(c, capture.layout)
     increments = np.concatenate(list(capture.increments(compensator, lambda _: None)))
     return Log(increments, (radians(latitude), radians(longitude), height), -yaw)
 
