@@ -116,11 +116,6 @@ class Gyro(Model):
     bias_deg_per_h: tuple[GyroBias, GyroBias, GyroBias]
     C_bg: Axes
 
-    @property
-    def C_bg_array(self) -> Array:
-        """Gyro axes to body, shape (3, 3)."""
-        return _array(self.C_bg)
-
 
 class Accelerometer(Model):
     """The accelerometers: ``dv_b = C_ba @ (N / scale - bias * tau)``."""
@@ -128,11 +123,6 @@ class Accelerometer(Model):
     scale_pulse_per_m_s: tuple[AccelerometerScale, AccelerometerScale, AccelerometerScale]
     bias_ug: tuple[AccelerometerBias, AccelerometerBias, AccelerometerBias]
     C_ba: Axes
-
-    @property
-    def C_ba_array(self) -> Array:
-        """Accelerometer axes to body, shape (3, 3)."""
-        return _array(self.C_ba)
 
 
 class SensingPoints(Model):
@@ -311,10 +301,10 @@ def coefficients(calibration: Calibration) -> Coefficients:
     return Coefficients(
         gyro_scale=_array(gyro.scale_arcsec_per_pulse, ARCSEC),
         gyro_bias=_array(gyro.bias_deg_per_h, DEG_PER_H),
-        C_bg=gyro.C_bg_array,
+        C_bg=_array(gyro.C_bg),
         accelerometer_scale=_array(accelerometer.scale_pulse_per_m_s),
         accelerometer_bias=_array(accelerometer.bias_ug, UG),
-        C_ba=accelerometer.C_ba_array,
+        C_ba=_array(accelerometer.C_ba),
         r_b=calibration.size_effect.r_m if calibration.size_effect else None,
         temperature=TemperatureTerms(
             terms.reference_degc,

@@ -94,11 +94,6 @@ class Pipeline:
         self._next = Compensator(coefficients, self._layout, self._rate_filter)
         self._repeats = True
 
-    @property
-    def replacing(self) -> bool:
-        """Whether a new calibration is not in use yet."""
-        return self._next is not None
-
     def _process(self, frames: Records) -> PipelineOutput:
         if not len(frames):
             return _NOTHING

@@ -9,6 +9,7 @@ print(receiver.counts)
 import os
 import select
 import socket
+from contextlib import AbstractContextManager
 from types import TracebackType
 from typing import Final, Self
 
@@ -42,7 +43,7 @@ _COUNTED: Final = Layout(
 )
 
 
-class Receiver:
+class Receiver(AbstractContextManager["Receiver"]):
     """Iterator over arrays of one or more samples as they arrive; made by `receive`.
 
     Each sample comes once and in the order of the counter: one that the network duplicates or delays is
@@ -68,21 +69,15 @@ class Receiver:
         self._decoder = DatagramDecoder()
         self._tracker = SequenceTracker(_COUNTED)
         self._ordered(b"")  # compiles the kernels before samples arrive
-        self._device = _open(split(url, ("udp", "tcp", "serial")))
-        self._is_packets = isinstance(self._device, socket.socket) and (
-            self._device.type == socket.SOCK_DGRAM
-        )
+        parts = split(url, ("udp", "tcp", "serial"))
+        self._is_packets = parts.scheme == "udp"
+        self._device = _open(parts)
         self._is_open = True
 
     @property
     def counts(self) -> SampleCounts:
         """Sample counts so far."""
         return self._tracker.counts
-
-    @property
-    def lost(self) -> int:
-        """Number of samples that were sent, by their counter, and not output."""
-        return self.counts.lost
 
     def __iter__(self) -> Self:
         return self
@@ -111,9 +106,6 @@ class Receiver:
         """Close the connection; the iteration ends."""
         self._is_open = False
         self._device.close()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

@@ -3,18 +3,15 @@
 import argparse
 import os
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import import_module
+from importlib.metadata import version
 
 from imudrv.errors import InputError
 
 OK, OUR_FAULT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 """Exit codes."""
-
-
-_PATIENCE_S = 1.0
 
 
 def run_program(
@@ -51,7 +48,7 @@ def _run(package: str, description: str, commands: Mapping[str, str], arguments:
     parser = argparse.ArgumentParser(
         prog=program, description=description, epilog=f"example: {program} {next(iter(commands))} --help"
     )
-    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
+    parser.add_argument("--version", action="version", version=f"{program} {version('imu50')}")
     subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
     module = None
     for command, text in commands.items():
@@ -63,16 +60,6 @@ def _run(package: str, description: str, commands: Mapping[str, str], arguments:
     parsed = parser.parse_args(arguments)
     code: int | None = module.run(parsed) if module else None
     return code
-
-
-class _Version(argparse.Action):
-    """Prints the version; looked up only when asked for."""
-
-    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
-        from importlib.metadata import version
-
-        sys.stdout.write(f"{parser.prog} {version('imu50')}\n")
-        parser.exit()
 
 
 def guarded(command: Callable[[], int | None]) -> int:
@@ -119,7 +106,7 @@ def _complain(text: str) -> None:
 
 @contextmanager
 def progress(title: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Show a progress bar on a terminal once the work has taken a second; elsewhere nothing.
+    """Show a progress bar on a terminal; elsewhere nothing.
 
     Parameters
     ----------
@@ -140,17 +127,6 @@ def progress(title: str, total: int) -> Iterator[Callable[[int], None]]:
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
     columns = TextColumn(title), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
-    bar = Progress(*columns, console=Console(stderr=True), transient=True)
-    task = bar.add_task(title, total=total)
-    begun = time.monotonic()
-
-    def advance(amount: int) -> None:
-        bar.advance(task, amount)
-        if not bar.live.is_started and time.monotonic() - begun > _PATIENCE_S:
-            bar.start()
-
-    try:
-        yield advance
-    finally:
-        if bar.live.is_started:
-            bar.stop()
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(title, total=total)
+        yield lambda amount: bar.advance(task, amount)

@@ -59,7 +59,6 @@ def test_a_calibration_is_replaced_without_a_sample_lost_doubled_or_left_uncompe
     got = np.concatenate([*before, *after, pipeline.close().increments])
 
     assert got["counter"].tolist() == list(range(SAMPLES))
-    assert not pipeline.replacing
     alone = [
         np.concatenate([*through(p, frames), p.close().increments])
         for p in (Pipeline(PROFILE, old, name), Pipeline(PROFILE, new, name))

@@ -135,7 +135,7 @@ def _compensator() -> Compensator:
 
 
 def _navigator(q_nb: NDArray[np.float64], *, matrices: bool) -> Navigator:
-    return Navigator.from_site(SCENARIO.site, q_nb, C_ba=KNOWN.C_ba if matrices else None, every=EVERY)
+    return Navigator(SCENARIO.site.place, q_nb, C_ba=KNOWN.C_ba if matrices else None, every=EVERY)
 
 
 def _through(path: Path, q_nb: NDArray[np.float64]) -> float:

@@ -201,7 +201,7 @@ def offline(profile: Profile, run: Scenario) -> Results:
     q_nb = alignment.result().q_nb
     yield "align", sha256(q_nb)
     for what, C_ba in (("navigate", None), ("navigate with H", full.C_ba)):
-        navigator = Navigator(site.latitude_rad, site.longitude_rad, site.height_m, None, q_nb, C_ba=C_ba)
+        navigator = Navigator(site.place._replace(gravity_m_s2=None), q_nb, C_ba=C_ba)
         yield what, sha256(np.concatenate([navigator.feed(piece) for piece in pieces(rest, 3000)]))
 
 

@@ -265,7 +265,7 @@ def listen(url: str, path: Path) -> None:
         while not stop.is_set():
             got.extend(receiver)
     np.save(path, np.concatenate(got))
-    print(f"lost {receiver.lost}, {receiver.rejected_bytes} bytes of something else")
+    print(f"lost {receiver.counts.lost}, {receiver.rejected_bytes} bytes of something else")
 
 
 def free_port() -> int:

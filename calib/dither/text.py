@@ -47,7 +47,7 @@ def dither_text(
         The calibration has no lever arms.
     """
     arms = lever_arms_of(calibration, f"unit {calibration.serial_number}")
-    C_bg, geometry = calibration.gyro.C_bg_array, (calibration.accelerometer.C_ba_array, arms.r_b)
+    C_bg, geometry = calibration.gyro.C_bg, (np.array(calibration.accelerometer.C_ba), arms.r_b)
     amplitude = np.asarray(amplitude_arcsec, np.float64) * ARCSEC
     block = in_increments(C_bg, amplitude, frequency_hz)
     case = of_case(C_bg, reaction * amplitude, frequency_hz)

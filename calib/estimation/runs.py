@@ -225,7 +225,7 @@ class _RunBuilder:
         if begin < stop:
             if self._started is None:
                 aligned = self._alignment.result()
-                self._started = aligned, Navigator.from_site(self._site, aligned.q_nb, C_ba=self._C_ba)
+                self._started = aligned, Navigator(self._site.place, aligned.q_nb, C_ba=self._C_ba)
             rows = self._started[1].feed(increments[max(first, begin) : stop])
             self._rows.append(rows[-(self._navigated + 1) % self._every :: self._every].copy())
             self._v_n.append(rows["v_n"].copy())

@@ -85,7 +85,7 @@ def _result(findings: IdentificationResult, arms: Sequence[LeverArms]) -> Iterat
             for j, axis in enumerate("XYZ")
         ),
     )
-    C_ba = findings.basis.calibration.accelerometer.C_ba_array
+    C_ba = np.array(findings.basis.calibration.accelerometer.C_ba)
     yield Figure(
         f"Sensing points, gauge {arms[0].gauge}, and sensing directions. Grey cross: origin of the body "
         "frame; dot in a circle: towards the reader, cross in a circle: away",

@@ -173,13 +173,7 @@ class _NavigationChain:
             if not self._alignment.done:
                 return
             site = self._site
-            self._navigator = Navigator(
-                site.latitude_rad,
-                site.longitude_rad,
-                site.height_m,
-                site.gravity_m_s2,
-                self._alignment.result().q_nb,
-            )
+            self._navigator = Navigator(site.place, self._alignment.result().q_nb)
         v_n = np.concatenate([self._remainder, self._navigator.feed(increments)["v_n"]])
         whole = len(v_n) - len(v_n) % self._samples
         self._means.append(v_n[:whole].reshape(-1, self._samples, 3).mean(axis=1))

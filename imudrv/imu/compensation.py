@@ -16,6 +16,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from imudrv.arrays import Array
 from imudrv.imu.coefficients import Coefficients
 from imudrv.imu.rate_filter import RateFilter, RateFilterName
 from imudrv.imu.rate_filter import rate_filter as make_filter
@@ -25,8 +26,6 @@ from imudrv.records import INCREMENTS, Flag, Records
 from imudrv.units import NS
 from imudrv.vectors import Matrix, Vector, add, matrix, put, rotate, row, scale, subtract, times, vector_at
 from imudrv.wire.layout import Layout
-
-Array = NDArray[np.float64]
 
 MAX_TAPS: Final = 32
 """Longest rate filter."""

@@ -109,10 +109,7 @@ class DescriptorPort(Port):
     def __init__(self, url: str, device: serial.Serial | socket.socket) -> None:
         super().__init__(url, Source.HARDWARE)
         self._device = device
-        self._ready = [device.fileno()]
-        self._take: Callable[[int], bytes] = (
-            device.recv if isinstance(device, socket.socket) else partial(os.read, device.fileno())
-        )
+        self._fd = device.fileno()
         self._closed = False
 
     def read(self, timeout_s: float) -> Arrival:
@@ -120,8 +117,8 @@ class DescriptorPort(Port):
         if self._closed:
             raise PortLostError(f"{self.url}: the port is closed")
         try:
-            ready = select.select(self._ready, (), (), timeout_s)[0]
-            data = self._take(_AT_ONCE) if ready else b""
+            ready = select.select([self._fd], (), (), timeout_s)[0]
+            data = os.read(self._fd, _AT_ONCE) if ready else b""
         except BlockingIOError:
             return Arrival(now_ns(), b"")
         except OSError as error:

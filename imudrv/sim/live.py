@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass
 from math import ceil
 from typing import Final, NamedTuple
@@ -18,6 +18,7 @@ import numpy as np
 
 from imudrv.profiles.schema import Profile
 from imudrv.records import Records
+from imudrv.signals import handled
 from imudrv.sim.capture import WireChunk, wire
 from imudrv.sim.links import open_line
 from imudrv.sim.links.base import LineOptions
@@ -274,17 +275,8 @@ def _ahead(chunks: Iterator[WireChunk]) -> Generator[WireChunk, None, None]:
             yield chunk
 
 
-@contextmanager
-def _signals_set(stop: threading.Event) -> Iterator[None]:
+def _signals_set(stop: threading.Event) -> AbstractContextManager[None]:
     """Ctrl-C and SIGTERM end the run."""
     if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        for number in before:
-            signal.signal(number, lambda *_: stop.set())
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        return nullcontext()
+    return handled(lambda *_: stop.set(), signal.SIGINT, signal.SIGTERM)

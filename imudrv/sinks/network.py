@@ -178,8 +178,7 @@ class TcpSink(Sink):
 
     def publish(self, batch: Batch) -> None:
         """Send a batch."""
-        gone = [client for client in self._clients if not client.put(batch.datagrams)]
-        for client in gone:
+        for client in [client for client in self._clients if not client.put(batch.datagrams)]:
             self._remove(client)
 
     def poll(self) -> None:

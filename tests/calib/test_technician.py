@@ -60,7 +60,7 @@ class Performance:
             inside = (counter >= accepted.first_counter) & (counter <= accepted.last_counter)
             evidence = navigate_rotations(
                 lambda inside=inside: [self.samples[inside]],
-                calibration.accelerometer.C_ba_array,
+                np.array(calibration.accelerometer.C_ba),
                 self.scenario.site,
                 step.id,
                 NavigationOptions(self.procedure.rotation_limits(step), expected=step.up[1]),

@@ -24,7 +24,7 @@ from imudrv.imu.compensation import Compensator
 from imudrv.nav.alignment import Aligned, Alignment
 from imudrv.nav.attitude import quaternion_of_matrix
 from imudrv.nav.earth import earth_rate_n, normal_gravity
-from imudrv.nav.mechanisation import Navigator
+from imudrv.nav.mechanisation import Navigator, Place
 from imudrv.records import Records
 from imudrv.units import ARCSEC, DEG, DEG_PER_H, UG
 
@@ -60,7 +60,7 @@ class Log(NamedTuple):
 
     def navigated(self, begin_s: float, end_s: float, q_nb: ArrayLike) -> Records:
         """A row each second."""
-        return Navigator(*self.place, None, q_nb, every=100).feed(self.part(begin_s, end_s))
+        return Navigator(Place(*self.place), q_nb, every=100).feed(self.part(begin_s, end_s))
 
 
 @pytest.fixture(scope="module")
