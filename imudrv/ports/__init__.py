@@ -1,7 +1,7 @@
 """Ports, opened by URL: where wire bytes and CAN messages come from.
 
 =====================================================  ====================================================
-``serial:///dev/ttyUSB0``, ``/dev/ttyUSB0``  serial line, settings from the profile
+``serial:///dev/ttyUSB0``, ``/dev/ttyUSB0``            serial line, settings from the profile
 ``serial:///dev/serial/by-id/usb-FTDI_...``            by its stable name, the same in any USB socket
 ``...?baudrate=460800&parity=even``                    other settings: ``baudrate``, ``bytesize`` 5-8,
                                                        ``parity`` none, even, odd, mark, space,
