@@ -116,21 +116,6 @@ class Gyro(Model):
     bias_deg_per_h: tuple[GyroBias, GyroBias, GyroBias]
     C_bg: Axes
 
-    @property
-    def scale_rad_per_pulse(self) -> Array:
-        """Scale factors, rad per pulse, shape (3,), gyro axes."""
-        return _array(self.scale_arcsec_per_pulse, ARCSEC)
-
-    @property
-    def bias_rad_per_s(self) -> Array:
-        """Biases, rad/s, shape (3,), body axes."""
-        return _array(self.bias_deg_per_h, DEG_PER_H)
-
-    @property
-    def C_bg_array(self) -> Array:
-        """Gyro axes to body, shape (3, 3)."""
-        return _array(self.C_bg)
-
 
 class Accelerometer(Model):
     """The accelerometers: ``dv_b = C_ba @ (N / scale - bias * tau)``."""
@@ -138,21 +123,6 @@ class Accelerometer(Model):
     scale_pulse_per_m_s: tuple[AccelerometerScale, AccelerometerScale, AccelerometerScale]
     bias_ug: tuple[AccelerometerBias, AccelerometerBias, AccelerometerBias]
     C_ba: Axes
-
-    @property
-    def scale_pulse_per_m_s_array(self) -> Array:
-        """Scale factors, pulses per m/s, shape (3,), accelerometer axes."""
-        return _array(self.scale_pulse_per_m_s)
-
-    @property
-    def bias_m_s2(self) -> Array:
-        """Biases, m/s^2, shape (3,), accelerometer axes."""
-        return _array(self.bias_ug, UG)
-
-    @property
-    def C_ba_array(self) -> Array:
-        """Accelerometer axes to body, shape (3, 3)."""
-        return _array(self.C_ba)
 
 
 class SensingPoints(Model):
@@ -207,26 +177,6 @@ class Temperature(Model):
     gyro_scale_ppm_per_k: tuple[ScaleSlope, ScaleSlope, ScaleSlope]
     accelerometer_bias_ug_per_k: tuple[AccelerometerBiasSlope, AccelerometerBiasSlope, AccelerometerBiasSlope]
     accelerometer_scale_ppm_per_k: tuple[ScaleSlope, ScaleSlope, ScaleSlope]
-
-    @property
-    def gyro_bias_rad_per_s_per_k(self) -> Array:
-        """Change of the gyro biases, rad/s per kelvin, shape (3,)."""
-        return _array(self.gyro_bias_deg_per_h_per_k, DEG_PER_H)
-
-    @property
-    def gyro_scale_per_k(self) -> Array:
-        """Relative change of the gyro scale factors per kelvin, shape (3,)."""
-        return _array(self.gyro_scale_ppm_per_k, PPM)
-
-    @property
-    def accelerometer_bias_m_s2_per_k(self) -> Array:
-        """Change of the accelerometer biases, m/s^2 per kelvin, shape (3,)."""
-        return _array(self.accelerometer_bias_ug_per_k, UG)
-
-    @property
-    def accelerometer_scale_per_k(self) -> Array:
-        """Relative change of the accelerometer scale factors per kelvin, shape (3,)."""
-        return _array(self.accelerometer_scale_ppm_per_k, PPM)
 
 
 class Calibration(Model):
@@ -349,20 +299,20 @@ def coefficients(calibration: Calibration) -> Coefficients:
     """
     gyro, accelerometer, terms = calibration.gyro, calibration.accelerometer, calibration.temperature
     return Coefficients(
-        gyro_scale=gyro.scale_rad_per_pulse,
-        gyro_bias=gyro.bias_rad_per_s,
-        C_bg=gyro.C_bg_array,
-        accelerometer_scale=accelerometer.scale_pulse_per_m_s_array,
-        accelerometer_bias=accelerometer.bias_m_s2,
-        C_ba=accelerometer.C_ba_array,
+        gyro_scale=_array(gyro.scale_arcsec_per_pulse, ARCSEC),
+        gyro_bias=_array(gyro.bias_deg_per_h, DEG_PER_H),
+        C_bg=_array(gyro.C_bg),
+        accelerometer_scale=_array(accelerometer.scale_pulse_per_m_s),
+        accelerometer_bias=_array(accelerometer.bias_ug, UG),
+        C_ba=_array(accelerometer.C_ba),
         r_b=calibration.size_effect.r_m if calibration.size_effect else None,
         temperature=TemperatureTerms(
             terms.reference_degc,
             *terms.range_degc,
-            gyro_bias=terms.gyro_bias_rad_per_s_per_k,
-            gyro_scale=terms.gyro_scale_per_k,
-            accelerometer_bias=terms.accelerometer_bias_m_s2_per_k,
-            accelerometer_scale=terms.accelerometer_scale_per_k,
+            gyro_bias=_array(terms.gyro_bias_deg_per_h_per_k, DEG_PER_H),
+            gyro_scale=_array(terms.gyro_scale_ppm_per_k, PPM),
+            accelerometer_bias=_array(terms.accelerometer_bias_ug_per_k, UG),
+            accelerometer_scale=_array(terms.accelerometer_scale_ppm_per_k, PPM),
         )
         if terms
         else None,

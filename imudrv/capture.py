@@ -14,7 +14,6 @@ from imudrv.errors import InputError
 from imudrv.imu.clock import ClockModel
 from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import RateFilterName
-from imudrv.imu.rate_filter import rate_filter as make_filter
 from imudrv.imu.sequence import SequenceTracker
 from imudrv.profiles.schema import Profile
 from imudrv.recording.reader import Recording
@@ -267,10 +266,7 @@ def compensate(
         raise InputError(f"{capture.path}: expected a calibration, for the file contains none; give one")
     if not isinstance(calibration, Calibration):
         calibration = read_calibration(calibration)
-    interval_ns = capture.layout.interval_ns
-    compensator = Compensator(
-        coefficients(calibration), capture.layout, make_filter(rate_filter, interval_ns)
-    )
+    compensator = Compensator(coefficients(calibration), capture.layout, rate_filter)
     return np.concatenate(list(capture.increments(compensator, advance)))
 
 

@@ -151,3 +151,8 @@ class Arrival(NamedTuple):
 
     t_ns: int
     data: bytes | Records
+
+    @property
+    def size(self) -> int:
+        """Size of the data, bytes."""
+        return len(self.data) if isinstance(self.data, bytes) else self.data.nbytes

@@ -6,6 +6,7 @@ from pydantic import Field as Key
 
 from imudrv.files.model import Model
 from imudrv.nav.earth import normal_gravity
+from imudrv.nav.mechanisation import Place
 from imudrv.units import DEG
 
 
@@ -41,3 +42,8 @@ class Site(Model):
         if self.gravity_m_s2 is not None:
             return self.gravity_m_s2
         return normal_gravity(self.latitude_rad, self.height_m)
+
+    @property
+    def place(self) -> Place:
+        """The location as `imudrv.Navigator` takes it."""
+        return Place(self.latitude_rad, self.longitude_rad, self.height_m, self.gravity_m_s2)

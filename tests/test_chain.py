@@ -9,7 +9,7 @@ from imudrv import profiles
 from imudrv.calibration import Calibration, coefficients
 from imudrv.files.settings_file import parse
 from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import rate_filter
+from imudrv.imu.rate_filter import RateFilterName
 from imudrv.imu.sequence import SequenceTracker
 from imudrv.records import Flag, Records
 from imudrv.sim.capture import record
@@ -74,13 +74,12 @@ ROCKING: list[dict[str, object]] = [
 
 
 def driven(
-    profile: str, run: Scenario, calibration: Calibration, filter_name: str = "causal"
+    profile: str, run: Scenario, calibration: Calibration, filter_name: RateFilterName = "causal"
 ) -> tuple[Records, Records]:
     """Compensated increments and the truth of the same samples."""
     layout = profiles.load(profile).layout()
     decoder, tracker = CaptureDecoder(layout), SequenceTracker(layout)
-    rates = rate_filter(filter_name, layout.interval_ns)  # type: ignore[arg-type]
-    compensator = Compensator(coefficients(calibration), layout, rates)
+    compensator = Compensator(coefficients(calibration), layout, filter_name)
     got, truth = [], []
     for data, true in record(run, layout):
         got.append(compensator.feed(tracker.feed(decoder.feed(data))))

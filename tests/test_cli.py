@@ -231,6 +231,17 @@ def test_ctrl_c_leaves_no_half_file(bench: Path) -> None:
     assert not list(bench.glob("*long.raw*"))
 
 
+def test_ctrl_c_while_a_command_is_imported_gives_no_traceback(tmp_path: Path) -> None:
+    (tmp_path / "commands").mkdir()
+    (tmp_path / "commands" / "slow.py").write_text("raise KeyboardInterrupt")
+    program = (
+        "import sys; from imudrv.terminal import run_program\n"
+        "sys.exit(run_program('commands', '', {'slow': ''}, ['slow']))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, timeout=120)
+    assert (done.returncode, done.stderr) == (130, b"interrupted\n")
+
+
 def test_real_laser_gyro_pulses_are_unchanged_by_encoding_and_decoding(data: Path, tmp_path: Path) -> None:
     source = data / "lasergyro.imu"
     tool = [sys.executable, str(ROOT / "tools" / "psins_to_wire.py"), str(source), "-o", "real.raw"]

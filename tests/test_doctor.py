@@ -25,12 +25,12 @@ from imudrv.doctor.verdict import Finding, Verdict
 from imudrv.errors import InputError
 from imudrv.files.settings_file import parse
 from imudrv.ports import Arrival, Port, PortEndedError
-from imudrv.ports.url import split
 from imudrv.profiles.schema import Profile, SerialLine
 from imudrv.records import MESSAGE, Reason, Source
 from imudrv.sim.capture import wire
 from imudrv.sim.live import play
 from imudrv.sim.scenario import Scenario
+from imudrv.url import split
 
 RS422, ACC, CAN, CANFD = (
     profiles.load(name) for name in ("imu50-rs422", "imu50-rs422-acc", "imu50-can", "imu50-canfd")

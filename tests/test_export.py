@@ -64,7 +64,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 def test_tables_have_the_recorded_increments_to_the_bit(recorded: Recording, tmp_path: Path) -> None:
     expected = samples()
     for kind in ("csv", "npz"):
-        assert export(recorded, kind, tmp_path / f"out.{kind}") == (SAMPLES, 2)
+        export(recorded, kind, tmp_path / f"out.{kind}")
     table = np.load(tmp_path / "out.npz")
     assert sorted(table) == ["counter", "dtheta", "dv", "flags", "interval_ns", "t_ns"]
     rows = np.genfromtxt(tmp_path / "out.csv", delimiter=",", names=True, dtype=None)
@@ -79,7 +79,7 @@ def test_tables_have_the_recorded_increments_to_the_bit(recorded: Recording, tmp
 
 def test_raw_is_the_bytes_of_the_wire(recorded: Recording, tmp_path: Path) -> None:
     expected = b"".join(bytes([n, 255 - n]) * (n + 1) for n in range(50))
-    assert export(recorded, "raw", tmp_path / "out.raw") == (len(expected), 0)
+    export(recorded, "raw", tmp_path / "out.raw")
     assert (tmp_path / "out.raw").read_bytes() == expected
 
 
@@ -90,7 +90,7 @@ def test_candump_has_every_message(tmp_path: Path) -> None:
     messages["data"][:, :8] = np.arange(320).reshape(40, 8) % 256
     arrivals = [Arrival(BEGIN_NS, piece) for piece in np.split(messages, 8)]
     recording = record(tmp_path / "run.mcap", "imu50-can", arrivals, samples()[:0])
-    assert export(recording, "candump", tmp_path / "out.log") == (40, 0)
+    export(recording, "candump", tmp_path / "out.log")
     decoded, rejects = CandumpDecoder().feed((tmp_path / "out.log").read_bytes())
     assert rejects.size == 0
     assert np.array_equal(decoded, messages)
@@ -101,7 +101,7 @@ def test_candump_has_every_message(tmp_path: Path) -> None:
 
 def test_imr_reads_back_by_its_manual_and_its_sums_do_not_drift(recorded: Recording, tmp_path: Path) -> None:
     path = tmp_path / "out.imr"
-    assert export(recorded, "imr", path) == (SAMPLES, 2)
+    export(recorded, "imr", path)
     data = path.read_bytes()
     assert len(data) == 512 + 32 * SAMPLES
     # Field by field at the offsets of NovAtel's table, packed.
@@ -144,7 +144,7 @@ def test_imr_refuses_an_increment_that_it_cannot_hold(tmp_path: Path) -> None:
 def test_ros2_has_rates_over_each_samples_own_interval(recorded: Recording, tmp_path: Path) -> None:
     reader = pytest.importorskip("mcap_ros2.reader")
     path = tmp_path / "ros2.mcap"
-    assert export(recorded, "ros2", path) == (SAMPLES, 2)
+    export(recorded, "ros2", path)
     expected = samples()
     count = 0
     for n, message in enumerate(reader.read_ros2_messages(str(path), log_time_order=False)):
@@ -179,5 +179,5 @@ def test_an_unknown_kind_is_refused(recorded: Recording, tmp_path: Path) -> None
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "candump"])
 def test_a_recording_without_a_sample_is_exported_too(kind: str, tmp_path: Path) -> None:
     recording = record(tmp_path / "run.mcap", "imu50-rs422", [], samples()[:0])
-    assert export(recording, kind, tmp_path / f"out.{kind}") == (0, 0)
+    export(recording, kind, tmp_path / f"out.{kind}")
     assert (tmp_path / f"out.{kind}").exists()

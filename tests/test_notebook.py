@@ -84,7 +84,7 @@ def test_increments_are_those_of_the_stages_one_by_one(here: Path) -> None:
     compensator = imudrv.Compensator(
         imudrv.coefficients(imudrv.read_calibration("unit.yaml")),
         layout,
-        imudrv.rate_filter("centred", layout.interval_ns),
+        "centred",
     )
     expected = np.concatenate(list(capture.increments(compensator)))
     for given in (capture, "z_up.raw"):  # a capture can be read again, from its beginning

@@ -68,7 +68,7 @@ def test_udp_brings_every_sample_bit_for_bit(udp: Udp) -> None:
     udp.send(datagrams(sent[60:72]))
     udp.send(datagrams(sent[72:100]))
     np.testing.assert_array_equal(take(udp.receiver, 100), sent)
-    assert udp.receiver.lost == 0
+    assert udp.receiver.counts.lost == 0
     assert udp.receiver.rejected_bytes == 0
 
 
@@ -77,7 +77,7 @@ def test_what_is_missing_is_counted_across_the_wrap_of_the_counter(udp: Udp) -> 
     kept = np.delete(sent, [3, 4, 5, 8])
     udp.send(datagrams(kept))
     np.testing.assert_array_equal(take(udp.receiver, 6), kept)
-    assert udp.receiver.lost == 4
+    assert udp.receiver.counts.lost == 4
     assert udp.receiver.counts.closes
 
 
@@ -87,14 +87,14 @@ def test_duplicate_and_late_samples_are_dropped_and_counted(udp: Udp) -> None:
         udp.send(datagrams(sent[k : k + 1]))
     assert take(udp.receiver, 6)["counter"].tolist() == [0, 1, 4, 5, 6, 7]
     counts = udp.receiver.counts
-    assert (counts.duplicate, counts.out_of_order, counts.missing, udp.receiver.lost) == (2, 1, 1, 2)
+    assert (counts.duplicate, counts.out_of_order, counts.missing, udp.receiver.counts.lost) == (2, 1, 1, 2)
 
 
 def test_a_restart_of_the_driver_loses_nothing(udp: Udp) -> None:
     udp.send(datagrams(increments(3, first=5_000)))
     udp.send(datagrams(increments(3)))
     assert take(udp.receiver, 6)["counter"].tolist() == [5_000, 5_001, 5_002, 0, 1, 2]
-    assert udp.receiver.lost == 0
+    assert udp.receiver.counts.lost == 0
     assert udp.receiver.counts.restarts == 1
 
 
@@ -139,7 +139,7 @@ def test_tcp_brings_every_sample_in_any_pieces_until_the_other_end_closes() -> N
             assert list(receiver) == []
         thread.join()
     np.testing.assert_array_equal(got, sent)
-    assert receiver.lost == 0
+    assert receiver.counts.lost == 0
 
 
 def test_a_serial_line_brings_every_sample_until_it_is_unplugged() -> None:
@@ -167,12 +167,12 @@ def test_a_serial_line_brings_every_sample_until_it_is_unplugged() -> None:
         "http://127.0.0.1:80",
         "serial://",
         "serial:///dev/null?baudrate=quick",
-        "serial:///dev/null?parity=even",
+        "serial:///dev/null?colour=red",
         "5005",
     ],
 )
 def test_a_wrong_url_is_reported(url: str) -> None:
-    with pytest.raises(InputError, match=rf"^'?{url.replace('?', '[?]')}'?: expected .*://"):
+    with pytest.raises(InputError, match=rf"^{url.replace('?', '[?]')}: (expected .*://|1 fault)"):
         receive(url)
 
 

@@ -116,7 +116,7 @@ def test_chunks_of_any_compression_are_read(
 
 def test_packing_makes_it_smaller_and_changes_nothing(recorded: Path, tmp_path: Path) -> None:
     path = tmp_path / "packed.mcap"
-    assert pack(recorded, path) == (33, False)
+    pack(recorded, path)
     assert path.stat().st_size < recorded.stat().st_size
     assert not Recording(path).cut
     assert contents(Recording(path)) == contents(Recording(recorded))
@@ -138,7 +138,8 @@ def test_a_cut_recording_is_packed_up_to_its_cut_and_in_place(recorded: Path, tm
     path = tmp_path / "run.mcap"
     path.write_bytes(recorded.read_bytes()[:-900])
     before = contents(Recording(path))
-    assert pack(path, path).cut
+    assert Recording(path).cut
+    pack(path, path)
     assert not Recording(path).cut
     assert contents(Recording(path)) == before
     assert [p.name for p in tmp_path.iterdir()] == ["run.mcap"]

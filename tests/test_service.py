@@ -235,7 +235,7 @@ def test_every_sample_is_sent_in_order_and_equals_that_of_the_offline_command(fo
         assert service.stop() == 0
     live = np.concatenate(got)
     assert live["counter"].tolist() == list(range(2000))
-    assert receiver.lost == 0
+    assert receiver.counts.lost == 0
 
     command = [sys.executable, "-m", "imudrv", "compensate", "run.mcap", "-o", "offline.npz"]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=DEADLINE_S)
@@ -554,7 +554,7 @@ def test_a_tcp_client_that_stops_reading_loses_its_own_samples_only(folder: Path
                 while total < sent:
                     total += len(next(reader))
                 assert sent < 400_000, "the stuck client's queue has no bound"
-            assert reader.lost == 0
+            assert reader.counts.lost == 0
             until(lambda: service.good() == sent, "all of them counted")
         assert service.stop() == 0
 

@@ -10,7 +10,6 @@ from realtime import DEADLINE_S
 
 from imudrv.calibration import coefficients, write_calibration
 from imudrv.errors import InputError
-from imudrv.imu.rate_filter import rate_filter
 from imudrv.pipeline import Pipeline
 from imudrv.recording.reader import Recording
 from imudrv.records import Flag, Records
@@ -85,7 +84,7 @@ def test_one_recording_follows_another_between_two_reads_and_nothing_is_lost_bet
 
 def replayed(recording: Recording) -> Records:
     """Increments that the wire of a recording gives."""
-    pipeline = Pipeline(recording.profile, coefficients(NOMINAL), rate_filter("causal", 1_000_000))
+    pipeline = Pipeline(recording.profile, coefficients(NOMINAL), "causal")
     increments = [pipeline.feed(arrival.data, arrival.t_ns).increments for arrival in recording.arrivals()]
     return np.concatenate([*increments, pipeline.close().increments])
 

@@ -31,7 +31,6 @@ from rich.table import Table
 
 from imudrv.imu.coefficients import Coefficients
 from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import rate_filter
 from imudrv.imu.sequence import SequenceTracker
 from imudrv.profiles import load
 from imudrv.records import PULSES, Flag, Records
@@ -171,13 +170,12 @@ def throughput(rounds: int) -> list[Measure]:
     """
     pieces = capture(SAMPLES)
     some = b"".join(pieces[: SLOW_SAMPLES // PIECE])
-    causal = rate_filter("causal", LAYOUT.interval_ns)
 
     # Run each stage once: compiles its kernels and makes the input of the next one.
     decoder, tracker = StreamDecoder(LAYOUT), SequenceTracker(LAYOUT)
     frames = [decoder.feed(piece).frames for piece in pieces]
     pulses = [tracker.feed(piece) for piece in frames]
-    increments = Compensator(CALIBRATION, LAYOUT, causal).feed(pulses[0])
+    increments = Compensator(CALIBRATION, LAYOUT).feed(pulses[0])
     count = sum(map(len, frames))
 
     by_loop = plain_decode(some)
@@ -195,7 +193,7 @@ def throughput(rounds: int) -> list[Measure]:
     def flow() -> tuple[float, float, float]:
         """Pass the capture through all stages, piece by piece; return the seconds of each."""
         decoder, tracker = StreamDecoder(LAYOUT), SequenceTracker(LAYOUT)
-        compensator = Compensator(CALIBRATION, LAYOUT, causal)
+        compensator = Compensator(CALIBRATION, LAYOUT)
         decoding = accounting = compensating = 0.0
         for piece in pieces:
             begin = time.perf_counter()

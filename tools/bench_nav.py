@@ -20,7 +20,6 @@ from imudrv.calibration import coefficients
 from imudrv.capture import Capture
 from imudrv.files.settings_file import parse
 from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import rate_filter
 from imudrv.nav.attitude import quaternion_of_matrix
 from imudrv.nav.mechanisation import Navigator
 from imudrv.profiles import load
@@ -139,11 +138,11 @@ def _write(path: Path) -> NDArray[np.float64]:
 
 
 def _compensator() -> Compensator:
-    return Compensator(KNOWN, LAYOUT, rate_filter("causal", LAYOUT.interval_ns))
+    return Compensator(KNOWN, LAYOUT)
 
 
 def _navigator(q_nb: NDArray[np.float64], *, matrices: bool) -> Navigator:
-    return Navigator.from_site(SCENARIO.site, q_nb, C_ba=KNOWN.C_ba if matrices else None, every=EVERY)
+    return Navigator(SCENARIO.site.place, q_nb, C_ba=KNOWN.C_ba if matrices else None, every=EVERY)
 
 
 def _process(path: Path, q_nb: NDArray[np.float64]) -> float:

@@ -38,7 +38,7 @@ from imudrv.calibration import Calibration, coefficients
 from imudrv.files.settings_file import parse
 from imudrv.imu.coefficients import Coefficients
 from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import NAMES, rate_filter
+from imudrv.imu.rate_filter import NAMES
 from imudrv.imu.sequence import SequenceTracker
 from imudrv.nav.alignment import Alignment
 from imudrv.nav.mechanisation import Navigator
@@ -201,21 +201,21 @@ def offline(profile: Profile, run: Scenario) -> Results:
     q_nb = alignment.result().q_nb
     yield "align", sha256(q_nb)
     for what, C_ba in (("navigate", None), ("navigate with H", full.C_ba)):
-        navigator = Navigator(site.latitude_rad, site.longitude_rad, site.height_m, None, q_nb, C_ba=C_ba)
+        navigator = Navigator(site.place._replace(gravity_m_s2=None), q_nb, C_ba=C_ba)
         yield what, sha256(np.concatenate([navigator.feed(piece) for piece in pieces(rest, 3000)]))
 
 
 def compensated(profile: Profile, pulses: Records, c: Coefficients, filter_name: Any) -> Records:
     """Return the increments of pulses fed in pieces."""
     layout = profile.layout()
-    compensator = Compensator(c, layout, rate_filter(filter_name, layout.interval_ns))
+    compensator = Compensator(c, layout, filter_name)
     return np.concatenate([*map(compensator.feed, pieces(pulses, 1500)), compensator.close()])
 
 
 def live(profile: Profile, run: Scenario) -> Results:
     """Feed bursts that arrive with random delays, on a host whose clock gains 20 ppm."""
     rng, layout = np.random.default_rng(6), profile.layout()
-    pipeline = Pipeline(profile, coefficients(WHOLE), rate_filter("centred", layout.interval_ns))
+    pipeline = Pipeline(profile, coefficients(WHOLE), "centred")
     outputs, now = [], 0
     for piece in wire(run, layout):
         sent, begin, i = piece.t_ns + piece.t_ns // 50_000 + 10**18, 0, 0

@@ -12,7 +12,7 @@ from calib.procedure.schema import Procedure
 from imudrv.calibration import write_calibration
 from imudrv.errors import InputError
 from imudrv.files import settings_file
-from imudrv.sim.live import speed_of
+from imudrv.url import speed_of
 
 SEED: Final = 1
 """Random seed of the rehearsal's unit and technician."""

@@ -48,7 +48,7 @@ def dither_text(
         The calibration has no lever arms.
     """
     arms = lever_arms_of(calibration, f"unit {calibration.serial_number}")
-    C_bg, geometry = calibration.gyro.C_bg_array, (calibration.accelerometer.C_ba_array, arms.r_b)
+    C_bg, geometry = np.array(calibration.gyro.C_bg), (np.array(calibration.accelerometer.C_ba), arms.r_b)
     amplitude = np.asarray(amplitude_arcsec, np.float64) * ARCSEC
     block = Dither(C_bg.T, amplitude, np.asarray(frequency_hz, np.float64))
     case = replace(block, axes_b=sensing_directions(C_bg), amplitude_rad=reaction * amplitude)

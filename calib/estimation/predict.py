@@ -28,7 +28,7 @@ from imudrv.arrays import Array
 from imudrv.errors import InputError
 from imudrv.nav.alignment import ALIGNMENT_S, Aligned
 from imudrv.nav.earth import earth_rate_n, normal_gravity
-from imudrv.nav.mechanisation import Navigator
+from imudrv.nav.mechanisation import Navigator, Place
 from imudrv.records import INCREMENTS
 from imudrv.units import DEG, MM, NS
 
@@ -153,7 +153,7 @@ def _planned_run(planned: PlannedRotation, k: int, latitude_rad: float, priors: 
     increments["dv_b"] = gravity * T * up_b + C_nb[1:].inv().apply(np.diff(v_n, axis=0))
     q_nb = np.roll(C_nb0.as_quat(), 1)
     every = BLOCK_NS // _PLAN_INTERVAL_NS
-    rows = Navigator(latitude_rad, 0.0, 0.0, None, q_nb, C_ba=np.eye(3), every=every).feed(increments)
+    rows = Navigator(Place(latitude_rad, 0.0, 0.0), q_nb, C_ba=np.eye(3), every=every).feed(increments)
     guard = round(GUARD_S / T)
     level = priors.accelerometer_bias / gravity
     heading = hypot(

@@ -21,7 +21,6 @@ from imudrv.arrays import Array
 from imudrv.calibration import Calibration, coefficients
 from imudrv.errors import InputError
 from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import rate_filter
 from imudrv.nav.alignment import ALIGNMENT_S, MIN_ALIGNMENT_S, Aligned, Alignment
 from imudrv.nav.mechanisation import Navigator
 from imudrv.records import Records
@@ -227,7 +226,7 @@ def navigate_capture(
     known = coefficients(calibration)
 
     def increments() -> Iterator[Records]:
-        compensator = Compensator(known, layout, rate_filter("causal", layout.interval_ns))
+        compensator = Compensator(known, layout)
         for pulses in read():
             yield compensator.feed(pulses)
         yield compensator.close()
@@ -270,7 +269,7 @@ class _RunBuilder:
         if begin < stop:
             if self._started is None:
                 aligned = self._alignment.result()
-                self._started = aligned, Navigator.from_site(self._site, aligned.q_nb, C_ba=self._C_ba)
+                self._started = aligned, Navigator(self._site.place, aligned.q_nb, C_ba=self._C_ba)
             rows = self._started[1].feed(increments[max(first, begin) : stop])
             self._rows.append(rows[-(self._navigated + 1) % self._every :: self._every].copy())
             self._v_n.append(rows["v_n"].copy())

@@ -116,7 +116,7 @@ class Progress:
 
     def navigate(self, q_nb: Quaternion) -> None:
         """Start the navigation log of the attempt at rest, with this attitude."""
-        navigator = Navigator.from_site(self.site, q_nb, C_ba=self.calibration.accelerometer.C_ba_array)
+        navigator = Navigator(self.site.place, q_nb, C_ba=self.calibration.accelerometer.C_ba)
         self.attempt.navigate(navigator, turn(conjugate(q_nb), (0.0, 0.0, 1.0)))
 
     def restart(self, *reasons: Message) -> Outcome:

@@ -86,7 +86,7 @@ def _result(identification: IdentificationResult, arms: Sequence[LeverArms]) -> 
             for j, axis in enumerate("XYZ")
         ),
     )
-    C_ba = identification.prior_calibration.calibration.accelerometer.C_ba_array
+    C_ba = np.array(identification.prior_calibration.calibration.accelerometer.C_ba)
     yield Figure(
         f"Sensing points, gauge {arms[0].gauge}, and sensing directions. Grey cross: origin of the body "
         "frame; dot in a circle: towards the reader, cross in a circle: away",

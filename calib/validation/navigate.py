@@ -39,7 +39,6 @@ from imudrv.calibration import coefficients
 from imudrv.errors import InputError
 from imudrv.imu.coefficients import Coefficients
 from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import rate_filter
 from imudrv.nav.alignment import Aligned, Alignment
 from imudrv.nav.mechanisation import Navigator
 from imudrv.records import Records
@@ -132,7 +131,7 @@ class _NavigationChain:
     def __init__(self, settings: TrialSettings, known: Coefficients) -> None:
         site, layout = settings.site, settings.layout
         self._site = site
-        self._compensator = Compensator(known, layout, rate_filter(settings.rate_filter, layout.interval_ns))
+        self._compensator = Compensator(known, layout, settings.rate_filter)
         self._skew = SkewCorrection(settings) if settings.skew_s else None
         priors = Priors()
         self._alignment = Alignment(
@@ -172,7 +171,7 @@ class _NavigationChain:
             increments = self._alignment.feed(increments)
             if not self._alignment.done:
                 return
-            self._navigator = Navigator.from_site(self._site, self._alignment.result().q_nb)
+            self._navigator = Navigator(self._site.place, self._alignment.result().q_nb)
         v_n = np.concatenate([self._remainder, self._navigator.feed(increments)["v_n"]])
         whole = len(v_n) - len(v_n) % self._samples
         self._means.append(v_n[:whole].reshape(-1, self._samples, 3).mean(axis=1))

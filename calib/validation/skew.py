@@ -8,7 +8,6 @@ from calib.validation.trial import TrialSettings
 from imudrv.calibration import coefficients
 from imudrv.errors import InputError
 from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import rate_filter
 from imudrv.records import Flag, Records
 from imudrv.units import NS
 
@@ -24,7 +23,7 @@ class SkewCorrection:
         layout = settings.layout
         self._interval_ns = layout.interval_ns
         bare = coefficients(settings.calibration.without_size_effect())
-        self._bare = Compensator(bare, layout, rate_filter(settings.rate_filter, layout.interval_ns))
+        self._bare = Compensator(bare, layout, settings.rate_filter)
         at = -settings.skew_s / (layout.interval_ns * NS)
         first = floor(at)
         u = at - first

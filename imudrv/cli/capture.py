@@ -3,7 +3,6 @@
 import argparse
 from pathlib import Path
 
-from imudrv import profiles
 from imudrv.capture import Capture
 from imudrv.cli.arguments import add_profile, message_stream
 
@@ -18,8 +17,7 @@ def add_capture(parser: argparse.ArgumentParser) -> None:
 
 def open_capture(arguments: argparse.Namespace) -> Capture:
     """Open the capture that the arguments name."""
-    profile = profiles.load(arguments.profile) if arguments.profile else None
-    return Capture(arguments.capture, profile, arguments.channel)
+    return Capture(arguments.capture, arguments.profile, arguments.channel)
 
 
 def print_losses(capture: Capture, output: Path) -> None:

@@ -11,7 +11,7 @@ from imudrv.errors import InputError
 from imudrv.files.outputs import require_other
 from imudrv.files.tables import increment_columns, table
 from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import NAMES, rate_filter
+from imudrv.imu.rate_filter import NAMES
 from imudrv.terminal import progress
 
 EXAMPLE: Final = "z-up.raw --profile imu50-rs422 --calibration unit.yaml -o increments.npz"
@@ -41,8 +41,7 @@ def run(arguments: argparse.Namespace) -> None:
         calibration, origin = recorded, "calibration of the recording"
     else:
         raise InputError("expected --calibration: only a recording of the service contains a calibration")
-    layout, filter_name = capture.layout, arguments.rate_filter
-    compensator = Compensator(coefficients(calibration), layout, rate_filter(filter_name, layout.interval_ns))
+    compensator = Compensator(coefficients(calibration), capture.layout, arguments.rate_filter)
     with (
         table(arguments.output, (".csv", ".npz", ".i50n"), {}) as rows,
         progress("compensate", capture.size) as advance,
@@ -56,6 +55,6 @@ def run(arguments: argparse.Namespace) -> None:
     )
     print(f"  unit {calibration.serial_number}, {origin}", file=stream)
     print(
-        f"  size effect {size_effect}; rate filter {filter_name}, delay {compensator.lag} samples",
+        f"  size effect {size_effect}; rate filter {arguments.rate_filter}, delay {compensator.lag} samples",
         file=stream,
     )

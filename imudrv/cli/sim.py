@@ -14,8 +14,9 @@ from imudrv.files.tables import table, writing
 from imudrv.service.printer import Printer
 from imudrv.sim import scenario as scenarios
 from imudrv.sim.capture import record
-from imudrv.sim.live import play, speed_of
+from imudrv.sim.live import play
 from imudrv.terminal import progress
+from imudrv.url import speed_of
 
 EXAMPLE: Final = "rocking --profile imu50-rs422 --port pty --link /tmp/imu50"
 

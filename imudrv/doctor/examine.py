@@ -17,10 +17,10 @@ from imudrv.doctor.verdict import Finding, Verdict
 from imudrv.errors import InputError
 from imudrv.files import settings_file
 from imudrv.ports import Port, PortEndedError, PortLostError, open_port
-from imudrv.ports.url import Url, split, value
 from imudrv.profiles.schema import CanLine, Profile, SerialLine
 from imudrv.records import MESSAGE, Records, Source
 from imudrv.units import NS
+from imudrv.url import Url, split, value
 
 BAUDRATES: Final = (460_800, 921_600, 115_200, 230_400, 1_000_000, 2_000_000, 3_000_000, 57_600, 38_400)
 """Tried in this order if the data fits no profile at the expected baud rate."""

@@ -5,7 +5,7 @@ arrival - elapsed shows the clock, and what is above it shows the host. With `el
 
     t = y_0 + (1 + skew) elapsed
 
-is the line under all arrivals of the last `window_s` that comes closest to them on average
+is the line under all arrivals of the last `WINDOW_NS` that comes closest to them on average
 (`imudrv.imu.envelope`). It changes at fixed counts only, and the stamps follow a new line by slewing; so any
 cut of the stream into pieces gives the same stamps, as does a replay of it.
 
@@ -23,6 +23,8 @@ from imudrv.kernels import kernel
 from imudrv.records import Flag, Records
 from imudrv.units import NS, NS_PER_S, PPM
 
+WINDOW_NS: Final = 90 * NS_PER_S
+"""Length of the window."""
 SLEW: Final = 200e-6
 """Largest change of a locked stamp towards a new line, as a fraction of the time since the last sample."""
 STALL_EDGES_S: Final = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
@@ -36,9 +38,7 @@ _ROOM: Final = 1 << 12
 _EDGES_NS: Final = tuple(round(edge * NS_PER_S) for edge in STALL_EDGES_S)
 _UNLOCKED: Final = int(Flag.CLOCK_UNLOCKED)
 
-CONSTANTS: Final = np.dtype(
-    [("interval_ns", np.int64), ("transmission_ns", np.int64), ("window_ns", np.int64)]
-)
+CONSTANTS: Final = np.dtype([("interval_ns", np.int64), ("transmission_ns", np.int64)])
 """Parameters of `ClockModel`."""
 
 STATE: Final = np.dtype(
@@ -110,15 +110,12 @@ class ClockModel:
         Sample interval.
     transmission_ns : int, optional
         Least time from the end of an interval to the arrival: a frame's time on the wire.
-    window_s : float, optional
-        Length of the envelope.
     """
 
-    def __init__(self, interval_ns: int, transmission_ns: int = 0, window_s: float = 90.0) -> None:
-        window_ns = round(window_s * NS_PER_S)
-        self._constants = np.array([(interval_ns, transmission_ns, window_ns)], CONSTANTS)
+    def __init__(self, interval_ns: int, transmission_ns: int = 0) -> None:
+        self._constants = np.array([(interval_ns, transmission_ns)], CONSTANTS)
         self._state = np.zeros(1, STATE)
-        self._points = room_for_points(window_ns)
+        self._points = room_for_points(WINDOW_NS)
         self._stamps = np.empty(_ROOM, STAMP)
         self._taken = self._fed = 0
 
@@ -238,12 +235,12 @@ def _place(sample: np.void, c: np.void, s: np.void, points: NDArray[np.int64]) -
     )
     if continues and x >= e["bin_end"]:
         before = height(line_of(e), x - dx)
-        continues = close_bin(e, points, x, c["window_ns"])
+        continues = close_bin(e, points, x, WINDOW_NS)
         s["ahead"] += above(line_of(e), x - dx, before)  # the stamps stay where they are
     if continues and e["fitted"]:
         continues = y > height(line_of(e), x) - _EARLY_NS
     if not continues:
-        if dx <= 0 or dx > c["window_ns"]:
+        if dx <= 0 or dx > WINDOW_NS:
             dx = c["interval_ns"]
         s["ahead"] = float(s["t_ns"] + dx - arrival_ns) if s["started"] else 0.0
         s["origin_x"], s["origin_y"] = sample["elapsed_ns"], arrival_ns - sample["elapsed_ns"]

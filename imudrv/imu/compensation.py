@@ -16,16 +16,16 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from imudrv.arrays import Array
 from imudrv.imu.coefficients import Coefficients
-from imudrv.imu.rate_filter import RateFilter
+from imudrv.imu.rate_filter import RateFilter, RateFilterName
+from imudrv.imu.rate_filter import rate_filter as make_filter
 from imudrv.imu.size_effect import SIZE_EFFECT, SizeEffect, dv_r, size_effect_constants, unpack_size_effect
 from imudrv.kernels import kernel
 from imudrv.records import INCREMENTS, Flag, Records
 from imudrv.units import NS
 from imudrv.vectors import Matrix, Vector, add, matrix, put, rotate, row, scale, subtract, times, vector_at
 from imudrv.wire.layout import Layout
-
-Array = NDArray[np.float64]
 
 MAX_TAPS: Final = 32
 """Longest rate filter."""
@@ -86,9 +86,9 @@ class Compensator:
         The calibration.
     layout : Layout
         Sample interval and temperature channels of the profile.
-    rate_filter : RateFilter
-        For the size effect, of at most `MAX_TAPS` taps. Its lag delays increments only where there is a size
-        effect to compensate.
+    rate_filter : {'causal', 'centred', 'dither'}
+        Filter of the rate for the size effect, see `imudrv.imu.rate_filter`. Its lag delays increments only
+        where there is a size effect to compensate.
 
     Attributes
     ----------
@@ -96,17 +96,18 @@ class Compensator:
         Whether there is a size effect to compensate.
     """
 
-    def __init__(self, coefficients: Coefficients, layout: Layout, rate_filter: RateFilter) -> None:
+    def __init__(
+        self, coefficients: Coefficients, layout: Layout, rate_filter: RateFilterName = "causal"
+    ) -> None:
         self.has_size_effect = coefficients.r_b is not None
-        self._constants = _constants(coefficients, layout, rate_filter)
+        self._constants = _constants(coefficients, layout, make_filter(rate_filter, layout.interval_ns))
         self._state = np.zeros(1, STATE)
-        self._lag = rate_filter.lag
         self._waiting = _NOTHING
 
     @property
     def lag(self) -> int:
         """Delay of the output, samples."""
-        return self._lag if self.has_size_effect else 0
+        return int(self._constants[0]["lag"]) if self.has_size_effect else 0
 
     def feed(self, pulses: Records) -> Records:
         """Compensate pulses.

@@ -167,7 +167,7 @@ def _convert(counts: Array, sensor: np.void, T: float, out: Numbers) -> bool:
     factor = T if sensor["values"] == Values.RATE else 1.0
     for axis in range(3):
         if sensor["is_float"][axis]:
-            number = np.int64(counts[axis]).view(np.float64)
+            number = float(np.int64(counts[axis]).view(np.float64))
             inside &= np.isfinite(number)
         else:
             number = float(counts[axis])

@@ -2,8 +2,10 @@
 
 from abc import ABC, abstractmethod
 
-from imudrv.errors import Imu50Error
+from imudrv.errors import Imu50Error, InputError
+from imudrv.profiles.schema import Profile
 from imudrv.records import Arrival, Source
+from imudrv.url import Url
 
 
 class PortLostError(Imu50Error):
@@ -59,3 +61,19 @@ class Port(ABC):
     @abstractmethod
     def close(self) -> None:
         """Close the device."""
+
+
+def require_transport(url: Url, profile: Profile, transport: str) -> None:
+    """Refuse a profile whose transport is not that of the port.
+
+    Raises
+    ------
+    InputError
+        The message names the URLs that fit the profile.
+    """
+    if profile.transport != transport:
+        fitting = "can://INTERFACE/CHANNEL" if profile.transport == "can" else "serial:///dev/..."
+        raise InputError(
+            f"{url.text}: expected a port for the {profile.transport} profile {profile.name}, "
+            f"like {fitting}, got a {transport} port; change the URL or the profile"
+        )

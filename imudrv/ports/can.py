@@ -17,11 +17,11 @@ import numpy as np
 from imudrv.errors import InputError
 from imudrv.files import settings_file
 from imudrv.hostclock import now_ns
-from imudrv.ports.base import Port, PortLostError
+from imudrv.ports.base import Port, PortLostError, require_transport
 from imudrv.ports.serial import explain
-from imudrv.ports.url import Url, require_transport, value
 from imudrv.profiles.schema import CanLine, Profile
 from imudrv.records import EXTENDED, MESSAGE, MESSAGE_ROW, Arrival, Records, Source
+from imudrv.url import Url, value
 
 # Our messages contain what python-can logs; without a handler it would go to the terminal.
 logging.getLogger("can").addHandler(logging.NullHandler())

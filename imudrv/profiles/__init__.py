@@ -4,21 +4,19 @@ schema  the profile file, checked completely, and its translation into the decod
 """
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
-from importlib import resources
 from pathlib import Path
+from typing import Final
 
-from imudrv.errors import InputError
+from imudrv.files import shipped as shipped_files
 from imudrv.files.settings_file import SettingsFile, read_file
 from imudrv.profiles.schema import Profile
+
+_FOLDER: Final = Path(__file__).parent
 
 
 def shipped() -> list[str]:
     """Return the names of the profiles that come with the package."""
-    return sorted(
-        p.name.removesuffix(".yaml") for p in resources.files(__name__).iterdir() if p.name.endswith(".yaml")
-    )
+    return shipped_files.names(_FOLDER)
 
 
 def load(name_or_path: str | os.PathLike[str]) -> Profile:
@@ -44,26 +42,9 @@ def load(name_or_path: str | os.PathLike[str]) -> Profile:
 
 def load_file(name_or_path: str | os.PathLike[str]) -> SettingsFile[Profile]:
     """Read a profile together with the content of its file; see `load`."""
-    with _file(name_or_path) as path:
-        return read_file(path, Profile)
+    return read_file(shipped_files.find("profile", name_or_path, _FOLDER), Profile)
 
 
 def content(name_or_path: str | os.PathLike[str]) -> bytes:
     """Return the content of a profile's file; see `load`."""
-    with _file(name_or_path) as path:
-        return path.read_bytes()
-
-
-@contextmanager
-def _file(name_or_path: str | os.PathLike[str]) -> Iterator[Path]:
-    name = os.fspath(name_or_path)
-    if name in shipped():
-        with resources.as_file(resources.files(__name__) / f"{name}.yaml") as path:
-            yield path
-        return
-    if not Path(name).exists():
-        raise InputError(
-            f"profile {name!r}: expected one of {', '.join(shipped())}, "
-            "or the path of a profile file; there is no such file"
-        )
-    yield Path(name)
+    return shipped_files.find("profile", name_or_path, _FOLDER).read_bytes()

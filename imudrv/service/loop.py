@@ -22,7 +22,6 @@ from imudrv import profiles
 from imudrv.calibration import coefficients
 from imudrv.diagnosis import LineState
 from imudrv.hostclock import now_ns
-from imudrv.imu.rate_filter import rate_filter
 from imudrv.pipeline import Pipeline, PipelineOutput
 from imudrv.ports import PortEndedError
 from imudrv.records import INCREMENTS, PULSES, Arrival, Source
@@ -109,7 +108,7 @@ class Service:
         self._pipeline = Pipeline(
             self._profile,
             coefficients(self._calibration.current.model),
-            rate_filter(settings.rate_filter, self._layout.interval_ns),
+            settings.rate_filter,
         )
         self._latency = Latency(self._layout.interval_ns)
         self._signals = signals or SignalFlags()

@@ -11,7 +11,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from imudrv.errors import InputError
 from imudrv.records import MESSAGE, Records
 from imudrv.sim.scenario import Faults, Silence
 from imudrv.units import NS
@@ -83,32 +82,24 @@ class StreamFaults:
 
     def __init__(self, faults: Faults, header: bytes, seed: int) -> None:
         rates = faults.stream
-        self._odds = (
-            (Kind.BIT_FLIPS, rates.bit_flips),
-            (Kind.BYTES_LOST, rates.bytes_lost),
-            (Kind.BYTES_INSERTED, rates.bytes_inserted),
-            (Kind.FALSE_SYNC_INSIDE, rates.false_sync_inside),
-            (Kind.LOST, rates.frame_lost),
-            (Kind.BYTES_BETWEEN, rates.bytes_between),
-            (Kind.FALSE_SYNC_BETWEEN, rates.false_sync_between),
-            (Kind.DOUBLED, rates.frame_doubled),
+        table: tuple[tuple[Kind, float, Callable[[bytes], bytes]], ...] = (
+            (Kind.BIT_FLIPS, rates.bit_flips, self._flip),
+            (Kind.BYTES_LOST, rates.bytes_lost, self._lose),
+            (Kind.BYTES_INSERTED, rates.bytes_inserted, lambda frame: self._insert(frame, self._random())),
+            (Kind.FALSE_SYNC_INSIDE, rates.false_sync_inside, lambda frame: self._insert(frame, header)),
+            (Kind.LOST, rates.frame_lost, lambda frame: b""),
+            (Kind.BYTES_BETWEEN, rates.bytes_between, lambda frame: self._random() + frame),
+            (Kind.FALSE_SYNC_BETWEEN, rates.false_sync_between, lambda frame: header + frame),
+            (Kind.DOUBLED, rates.frame_doubled, lambda frame: frame + frame),
         )
+        self._odds = [(kind, rate) for kind, rate, _ in table]
+        self._act: dict[Kind, Callable[[bytes], bytes]] = {kind: act for kind, _, act in table}
+        self._act[Kind.SILENCE] = lambda frame: b""
         self._silences = faults.silences + faults.unplugs
         self._header = header
         # separate generators for kind and details: chunks of any size draw the same
         self._draw = _generator(seed, 5)
         self._rng = _generator(seed, 6)
-        self._act: dict[Kind, Callable[[bytes], bytes]] = {
-            Kind.BIT_FLIPS: self._flip,
-            Kind.BYTES_LOST: self._lose,
-            Kind.BYTES_INSERTED: lambda frame: self._insert(frame, self._random()),
-            Kind.FALSE_SYNC_INSIDE: lambda frame: self._insert(frame, header),
-            Kind.LOST: lambda frame: b"",
-            Kind.BYTES_BETWEEN: lambda frame: self._random() + frame,
-            Kind.FALSE_SYNC_BETWEEN: lambda frame: header + frame,
-            Kind.DOUBLED: lambda frame: frame + frame,
-            Kind.SILENCE: lambda frame: b"",
-        }
 
     def apply(self, frames: Bytes, t_ns: NDArray[np.int64]) -> tuple[bytes, Damage]:
         """Apply the faults to frames.
@@ -126,18 +117,8 @@ class StreamFaults:
             Bytes that arrive.
         Damage
             One row per frame.
-
-        Raises
-        ------
-        InputError
-            Numbers of times and frames differ, or frames are shorter than 2 bytes.
         """
         n, length = frames.shape
-        if t_ns.shape != (n,) or length < 2:
-            raise InputError(
-                "faults: expected n frames of 2 bytes or more and n times, "
-                f"got shapes {frames.shape} and {t_ns.shape}"
-            )
         kind = _kinds(self._odds, self._silences, t_ns, self._draw)
         size = np.full(n, length)
         pieces = []

@@ -4,20 +4,21 @@ Segments of the motion follow each other; each starts at rest in the attitude at
 Durations are rounded to whole sample intervals.
 """
 
-from importlib import resources
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field as Key
 from pydantic import model_validator
 
 from imudrv.calibration import Calibration, read_calibration
-from imudrv.errors import InputError
+from imudrv.files import shipped as shipped_files
 from imudrv.files.model import Model
 from imudrv.files.settings_file import parse, read
 from imudrv.site import Site
 from imudrv.units import NS
+
+_FOLDER: Final = Path(__file__).parent / "scenarios"
 
 Duration = Annotated[float, Key(gt=0, le=1_000_000)]
 Amount = Annotated[float, Key(ge=0, le=1e6)]
@@ -232,7 +233,18 @@ class CounterJump(Model):
     by: Annotated[int, Key(ge=-(2**32), le=2**32)]
 
 
-class StreamRates(Model):
+class _Rates(Model):
+    """Probabilities of faults that exclude each other."""
+
+    @model_validator(mode="after")
+    def _at_most_one(self) -> Self:
+        total = sum(self.model_dump().values())
+        if total > 1.0:
+            raise ValueError(f"expected probabilities with a sum of at most 1, got {total:g}")
+        return self
+
+
+class StreamRates(_Rates):
     """Probabilities of the faults of a serial line per frame; a frame has at most one fault."""
 
     bit_flips: Fraction = 0.0
@@ -244,29 +256,13 @@ class StreamRates(Model):
     false_sync_between: Fraction = 0.0
     frame_doubled: Fraction = 0.0
 
-    @model_validator(mode="after")
-    def _no_more_than_all(self) -> Self:
-        _at_most_one(self)
-        return self
 
-
-class MessageRates(Model):
+class MessageRates(_Rates):
     """Probabilities of the faults of a CAN bus per message; a message has at most one fault."""
 
     lost: Fraction = 0.0
     doubled: Fraction = 0.0
     swapped: Fraction = 0.0
-
-    @model_validator(mode="after")
-    def _no_more_than_all(self) -> Self:
-        _at_most_one(self)
-        return self
-
-
-def _at_most_one(rates: StreamRates | MessageRates) -> None:
-    total = sum(rates.model_dump().values())
-    if total > 1.0:
-        raise ValueError(f"expected probabilities with a sum of at most 1, got {total:g}")
 
 
 class Faults(Model):
@@ -331,9 +327,7 @@ NOMINAL = parse(
 
 def shipped() -> list[str]:
     """Return the names of the scenarios that come with the package."""
-    return sorted(
-        p.name.removesuffix(".yaml") for p in (resources.files(__package__) / "scenarios").iterdir()
-    )
+    return shipped_files.names(_FOLDER)
 
 
 def load(name_or_path: str) -> Scenario:
@@ -354,15 +348,13 @@ def load(name_or_path: str) -> Scenario:
     InputError
         The scenario does not exist, or it or its calibration file is not valid.
     """
-    if name_or_path in shipped():
-        with resources.as_file(resources.files(__package__) / "scenarios" / f"{name_or_path}.yaml") as path:
-            return _read(path)
-    if not Path(name_or_path).exists():
-        raise InputError(
-            f"scenario {name_or_path!r}: expected one of {', '.join(shipped())}, "
-            "or the path of a scenario file; there is no such file"
-        )
-    return _read(Path(name_or_path))
+    path = shipped_files.find("scenario", name_or_path, _FOLDER)
+    scenario = read(path, Scenario)
+    if scenario.unit.calibration_file is None:
+        return scenario
+    calibration = read_calibration(path.parent / scenario.unit.calibration_file)
+    unit = scenario.unit.model_copy(update={"calibration_file": None, "calibration": calibration})
+    return scenario.model_copy(update={"unit": unit})
 
 
 def files(name_or_path: str) -> tuple[Path, ...]:
@@ -372,15 +364,6 @@ def files(name_or_path: str) -> tuple[Path, ...]:
         return ()
     calibration = read(path, Scenario).unit.calibration_file
     return (path,) if calibration is None else (path, path.parent / calibration)
-
-
-def _read(path: Path) -> Scenario:
-    scenario = read(path, Scenario)
-    if scenario.unit.calibration_file is None:
-        return scenario
-    calibration = read_calibration(path.parent / scenario.unit.calibration_file)
-    unit = scenario.unit.model_copy(update={"calibration_file": None, "calibration": calibration})
-    return scenario.model_copy(update={"unit": unit})
 
 
 def samples(scenario: Scenario, interval_ns: int) -> int:

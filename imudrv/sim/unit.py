@@ -12,14 +12,16 @@ fraction is carried into the next sample.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import exp, pi, sin
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from imudrv.arrays import Array
+from imudrv.calibration import coefficients
 from imudrv.errors import InputError
+from imudrv.imu.coefficients import Coefficients, TemperatureTerms
 from imudrv.kernels import kernel
 from imudrv.nav.earth import earth_rate_n
 from imudrv.records import PULSES, Records
@@ -66,24 +68,6 @@ class Chunk:
     truth: Records
 
 
-@dataclass(frozen=True)
-class TrueUnit:
-    """True parameters of a unit, in SI units; arrays are by sensor axis, matrices as in the file."""
-
-    gyro_scale: Array  # rad per pulse
-    gyro_bias: Array  # rad/s, on body axes
-    C_bg: Array
-    accelerometer_scale: Array  # pulses per m/s
-    accelerometer_bias: Array  # m/s^2
-    C_ba: Array
-    r_b: Array  # (3, 3), row i the sensing point of accelerometer i, m
-    reference_degc: float
-    gyro_bias_per_k: Array
-    gyro_scale_per_k: Array
-    accelerometer_bias_per_k: Array
-    accelerometer_scale_per_k: Array
-
-
 class _Electronics(NamedTuple):
     """Parameters of the kernel, from integrals to pulses; gyro quantities are on the axes of the gyros."""
 
@@ -109,7 +93,7 @@ class _Electronics(NamedTuple):
     time_constant_s: float
 
 
-def draw_true_unit(scenario: Scenario) -> TrueUnit:
+def draw_true_unit(scenario: Scenario) -> Coefficients:
     """Draw the true unit from the calibration, the residuals and the seed of a scenario.
 
     Parameters
@@ -119,30 +103,21 @@ def draw_true_unit(scenario: Scenario) -> TrueUnit:
 
     Returns
     -------
-    TrueUnit
+    Coefficients
     """
-    calibration = scenario.unit.calibration or NOMINAL
+    nominal = coefficients(scenario.unit.calibration or NOMINAL)
     residuals = scenario.unit.residuals
-    gyro, accelerometer, temperature = calibration.gyro, calibration.accelerometer, calibration.temperature
-    rng = _generator(scenario, 2)
-    gyro_normal, accelerometer_normal = rng.standard_normal((2, 12))
-    none = np.zeros(3)
-    return TrueUnit(
-        gyro_scale=gyro.scale_rad_per_pulse * (1.0 + residuals.gyro_scale_ppm * PPM * gyro_normal[0:3]),
-        gyro_bias=gyro.bias_rad_per_s + residuals.gyro_bias_deg_per_h * DEG_PER_H * gyro_normal[3:6],
-        C_bg=_misaligned(residuals.gyro_misalignment_urad, gyro_normal[6:]) @ gyro.C_bg_array,
-        accelerometer_scale=accelerometer.scale_pulse_per_m_s_array
+    gyro_normal, accelerometer_normal = _generator(scenario, 2).standard_normal((2, 12))
+    return replace(
+        nominal,
+        gyro_scale=nominal.gyro_scale * (1.0 + residuals.gyro_scale_ppm * PPM * gyro_normal[0:3]),
+        gyro_bias=nominal.gyro_bias + residuals.gyro_bias_deg_per_h * DEG_PER_H * gyro_normal[3:6],
+        C_bg=_misaligned(residuals.gyro_misalignment_urad, gyro_normal[6:]) @ nominal.C_bg,
+        accelerometer_scale=nominal.accelerometer_scale
         * (1.0 + residuals.accelerometer_scale_ppm * PPM * accelerometer_normal[0:3]),
-        accelerometer_bias=accelerometer.bias_m_s2
+        accelerometer_bias=nominal.accelerometer_bias
         + residuals.accelerometer_bias_ug * UG * accelerometer_normal[3:6],
-        C_ba=_misaligned(residuals.accelerometer_misalignment_urad, accelerometer_normal[6:])
-        @ accelerometer.C_ba_array,
-        r_b=calibration.size_effect.r_m if calibration.size_effect else np.zeros((3, 3)),
-        reference_degc=temperature.reference_degc if temperature else 0.0,
-        gyro_bias_per_k=temperature.gyro_bias_rad_per_s_per_k if temperature else none,
-        gyro_scale_per_k=temperature.gyro_scale_per_k if temperature else none,
-        accelerometer_bias_per_k=temperature.accelerometer_bias_m_s2_per_k if temperature else none,
-        accelerometer_scale_per_k=temperature.accelerometer_scale_per_k if temperature else none,
+        C_ba=_misaligned(residuals.accelerometer_misalignment_urad, accelerometer_normal[6:]) @ nominal.C_ba,
     )
 
 
@@ -239,7 +214,7 @@ def _inverse(matrix: Array) -> Array:
     return np.asarray(np.linalg.inv(matrix), np.float64)
 
 
-def _body(scenario: Scenario, truth: TrueUnit, interval_s: float) -> Body:
+def _body(scenario: Scenario, truth: Coefficients, interval_s: float) -> Body:
     site = scenario.site
     x, y, z = (MM * offset for offset in scenario.start.pivot_offset_mm)
     dither = scenario.unit.dither
@@ -249,12 +224,12 @@ def _body(scenario: Scenario, truth: TrueUnit, interval_s: float) -> Body:
         omega_ie_n=earth_rate_n(site.latitude_rad),
         pivot_to_origin_b=(x, y, z),
         A=_inverse(truth.C_ba),
-        r_b=np.ascontiguousarray(truth.r_b),
+        r_b=np.zeros((3, 3)) if truth.r_b is None else truth.r_b,
         case=_dithering(scenario, truth, interval_s, dither.case_reaction if dither else 0.0),
     )
 
 
-def _dithering(scenario: Scenario, truth: TrueUnit, interval_s: float, fraction: float) -> Dithering:
+def _dithering(scenario: Scenario, truth: Coefficients, interval_s: float, fraction: float) -> Dithering:
     dither = scenario.unit.dither or Dither(amplitude_arcsec=(0.0, 0.0, 0.0), frequency_hz=(1.0, 1.0, 1.0))
     G = _inverse(truth.C_bg)  # rows: the gyros' sensing directions in b
     frequency_hz = np.array(dither.frequency_hz)
@@ -267,28 +242,29 @@ def _dithering(scenario: Scenario, truth: TrueUnit, interval_s: float, fraction:
     )
 
 
-def _electronics(scenario: Scenario, truth: TrueUnit, interval_s: float) -> _Electronics:
+def _electronics(scenario: Scenario, truth: Coefficients, interval_s: float) -> _Electronics:
     unit = scenario.unit
     dither, temperature = unit.dither, unit.temperature
     settles = temperature.settles_at_degc
     G = _inverse(truth.C_bg)
+    terms = truth.temperature or TemperatureTerms(0.0, 0.0, 0.0)
     return _Electronics(
         interval_s=interval_s,
         G=G,
         gyro_scale=truth.gyro_scale,
         gyro_bias=truth.gyro_bias,
-        gyro_bias_per_k=truth.gyro_bias_per_k,
-        gyro_scale_per_k=truth.gyro_scale_per_k,
+        gyro_bias_per_k=terms.gyro_bias,
+        gyro_scale_per_k=terms.gyro_scale,
         gyro_noise=unit.noise.arw_deg_per_sqrt_h * DEG_PER_SQRT_H * interval_s**0.5,
         gyro_limit=float(unit.saturation.gyro_pulses),
         dither=_dithering(scenario, truth, interval_s, dither.in_increments if dither else 0.0),
         accelerometer_scale=truth.accelerometer_scale,
         accelerometer_bias=truth.accelerometer_bias,
-        accelerometer_bias_per_k=truth.accelerometer_bias_per_k,
-        accelerometer_scale_per_k=truth.accelerometer_scale_per_k,
+        accelerometer_bias_per_k=terms.accelerometer_bias,
+        accelerometer_scale_per_k=terms.accelerometer_scale,
         accelerometer_noise=unit.noise.vrw_m_s_per_sqrt_h * PER_SQRT_H * interval_s**0.5,
         accelerometer_limit=float(unit.saturation.accelerometer_pulses),
-        reference_degc=truth.reference_degc,
+        reference_degc=terms.reference_degc,
         start_degc=temperature.start_degc,
         slope_k_per_s=temperature.slope_k_per_h / 3600.0,
         rise_k=0.0 if settles is None else settles - temperature.start_degc,

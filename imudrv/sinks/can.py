@@ -13,9 +13,9 @@ from imudrv import profiles
 from imudrv.errors import InputError
 from imudrv.ports.base import PortLostError
 from imudrv.ports.can import prepare
-from imudrv.ports.url import split
 from imudrv.records import EXTENDED, PULSES, Records
 from imudrv.sinks.base import Batch, Sink, SinkState
+from imudrv.url import split
 from imudrv.wire.encode import CanEncoder
 from imudrv.wire.layout import Layout
 

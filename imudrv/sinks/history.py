@@ -98,5 +98,4 @@ class History:
 
 
 def _size(moment: Moment) -> int:
-    data = moment.arrival.data
-    return (len(data) if isinstance(data, bytes) else data.nbytes) + len(moment.datagrams) + _OBJECT_BYTES
+    return moment.arrival.size + len(moment.datagrams) + _OBJECT_BYTES

@@ -12,6 +12,7 @@ from contextlib import suppress
 from hashlib import sha256
 from importlib.metadata import version
 from io import BytesIO
+from operator import attrgetter
 from pathlib import Path
 from typing import Final, Generic, TypeVar
 
@@ -84,7 +85,7 @@ class Recorder:
     ) -> None:
         self._path = path
         self._can = layout.can
-        self._wire: _Queue[Arrival] = _Queue(_array_size if layout.can else _bytes_size)
+        self._wire: _Queue[Arrival] = _Queue(attrgetter("size"))
         self._datagrams: _Queue[bytes] = _Queue(len)
         self._notes: deque[tuple[int, int, Mapping[str, object]]] = deque(maxlen=1000)
         self._calibrations: deque[tuple[int, bytes]] = deque(maxlen=10)
@@ -122,8 +123,8 @@ class Recorder:
         """
         datagrams = [moment.datagrams for moment in moments if moment.datagrams]
         self._put += sum(map(len, datagrams)) // SIZE
-        self._wire.extend([moment.arrival for moment in moments])
-        self._datagrams.extend(datagrams)
+        self._wire.put(*(moment.arrival for moment in moments))
+        self._datagrams.put(*datagrams)
 
     def status(self, status: Mapping[str, object]) -> None:
         """Record the state of the service.
@@ -259,19 +260,10 @@ class _Queue(Generic[T]):
         self._items: deque[T] = deque()
         self._put = self._taken = 0
 
-    def put(self, item: T) -> None:
-        """Append (in the loop); drop the oldest items above the limit."""
-        self._items.append(item)
-        self._put += self._size(item) + _OVERHEAD
-        self._drop()
-
-    def extend(self, items: Sequence[T]) -> None:
-        """Append several items (in the loop); drop the oldest above the limit."""
+    def put(self, *items: T) -> None:
+        """Append items (in the loop); drop the oldest above the limit."""
         self._items.extend(items)
         self._put += sum(map(self._size, items)) + _OVERHEAD * len(items)
-        self._drop()
-
-    def _drop(self) -> None:
         with suppress(IndexError):
             while self._put - self._taken - self.dropped_size - self.dropped * _OVERHEAD > QUEUE_BYTES:
                 self.dropped_size += self._size(self._items.popleft())
@@ -285,14 +277,6 @@ class _Queue(Generic[T]):
                 items.append(self._items.popleft())
         self._taken += sum(map(self._size, items)) + _OVERHEAD * len(items)
         return items
-
-
-def _bytes_size(arrival: Arrival) -> int:
-    return len(arrival.data)
-
-
-def _array_size(arrival: Arrival) -> int:
-    return arrival.data.nbytes  # type: ignore[union-attr]
 
 
 class _Staging(BytesIO):

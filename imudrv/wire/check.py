@@ -153,8 +153,8 @@ def _absorb(
     kind, big_endian = check["kind"], check["big_endian"]
     a, b = int(first), int(second)
     if kind == CheckKind.XOR:
-        for p in range(np.uint64(start), np.uint64(stop)):
-            a ^= int(data[p])
+        for k in range(np.uint64(start), np.uint64(stop)):
+            a ^= int(data[k])
         return a, b
     if kind >= CheckKind.CRC or (kind == CheckKind.SUM and check["word"] == 1):
         return _absorb_bytes(data, start, stop, check, a), b

@@ -41,8 +41,7 @@ def word(data: Bytes, p: int, size: int, big_endian: bool) -> int:
         return short_number(data, p, 8 * size, False, big_endian)
     value = 0
     for k in range(size):
-        byte = np.int64(data[np.uint64(p + (k if big_endian else size - 1 - k))])
-        value = value << 8 | byte
+        value = value << 8 | int(data[np.uint64(p + (k if big_endian else size - 1 - k))])
     return int(value)
 
 

@@ -42,7 +42,6 @@ from imudrv.diagnosis import LineState
 from imudrv.errors import InputError
 from imudrv.files import settings_file
 from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import rate_filter
 from imudrv.imu.sequence import SequenceTracker
 from imudrv.recording.reader import Recording
 from imudrv.records import Arrival, Source
@@ -140,11 +139,7 @@ class Shown(OperatorScreen):
 
 def performed(scenario: Scenario) -> list[Batch]:
     """Samples of a scenario, in pieces of a fifth of a second."""
-    compensator = Compensator(
-        coefficients(NOMINAL.model_copy(update={"size_effect": None})),
-        LAYOUT,
-        rate_filter("causal", LAYOUT.interval_ns),
-    )
+    compensator = Compensator(coefficients(NOMINAL.model_copy(update={"size_effect": None})), LAYOUT)
     made = []
     for chunk in simulate(scenario, LAYOUT.interval_ns):
         for begin in range(0, len(chunk.pulses), 200):

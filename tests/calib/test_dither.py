@@ -169,7 +169,7 @@ def subtracted(d: Dither, C_ba: Array, C_bg: Array, name: str) -> tuple[Array, A
     pulses["elapsed_ns"] = TAU_NS * np.arange(1, n + 1)
     pulses["flags"] = Flag.VALID
     pulses["gyro"] = np.diff(np.rint(np.linalg.solve(C_bg, angle_b.T).T / fine), axis=0)
-    compensator = Compensator(c, profiles.load("imu50-rs422").layout(), FILTERS[name])
+    compensator = Compensator(c, profiles.load("imu50-rs422").layout(), name)
     got = compensator.feed(pulses)[25:]
     got = got[: round(PERIOD / TAU)]
     assert np.all(got["flags"] & Flag.SIZE_EFFECT)

@@ -22,7 +22,6 @@ from imudrv.calibration import coefficients, read_calibration
 from imudrv.capture import Capture
 from imudrv.errors import InputError
 from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import rate_filter
 from imudrv.records import INCREMENTS, Records
 from imudrv.sim.scenario import Dither
 from imudrv.site import Site
@@ -58,8 +57,7 @@ def captured(reference: Path) -> tuple[list[Run], Array]:
 
         def read(name: str = name) -> Any:
             capture = Capture(reference / f"{name}.raw", profile)
-            interval_ns = capture.layout.interval_ns
-            compensator = Compensator(known, capture.layout, rate_filter("causal", interval_ns))
+            compensator = Compensator(known, capture.layout)
             return capture.increments(compensator, lambda _: None)
 
         runs += navigate_rotations(read, known.C_ba, site, name).runs

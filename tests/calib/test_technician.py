@@ -17,7 +17,7 @@ from calib.procedure.engine import Engine
 from calib.procedure.events import Accepted, Event, Finished, Phase, Rejected, Restarted
 from calib.procedure.plan import load, predicted
 from calib.procedure.schema import Procedure
-from imudrv import Coefficients, Compensator, coefficients, load_profile, rate_filter
+from imudrv import Coefficients, Compensator, coefficients, load_profile
 from imudrv.errors import InputError
 from imudrv.records import Flag, Records
 from imudrv.sim.scenario import Scenario
@@ -60,7 +60,7 @@ class Performance:
             inside = (counter >= accepted.first_counter) & (counter <= accepted.last_counter)
             navigated = navigate_rotations(
                 lambda inside=inside: [self.samples[inside]],
-                calibration.accelerometer.C_ba_array,
+                np.array(calibration.accelerometer.C_ba),
                 self.scenario.site,
                 step.id,
                 NavigationOptions(self.procedure.rotation_limits(step), expected=step.up[1]),
@@ -76,7 +76,7 @@ def samples_of(scenario: Scenario) -> Records:
     calibration = scenario.unit.calibration
     assert calibration is not None
     plain: Coefficients = coefficients(calibration.model_copy(update={"size_effect": None}))
-    compensator = Compensator(plain, LAYOUT, rate_filter("centred", LAYOUT.interval_ns))
+    compensator = Compensator(plain, LAYOUT, "centred")
     samples = np.concatenate([compensator.feed(c.pulses) for c in simulate(scenario, LAYOUT.interval_ns)])
     for unplug in scenario.faults.unplugs:
         out = (samples["t_ns"] > unplug.at_s * 1e9) & (

@@ -24,7 +24,7 @@ from calib.validation.navigate import navigate
 from calib.validation.simulate import SimulatedUnit, campaign, scenario, subject, trial
 from calib.validation.trial import Trial, TrialSettings
 from calib.validation.verdict import Validation, evaluate, noise_velocity
-from imudrv import Capture, Compensator, coefficients, load_profile, rate_filter, write_calibration
+from imudrv import Capture, Compensator, coefficients, load_profile, write_calibration
 from imudrv.calibration import Calibration, SensingPoints, SizeEffect
 from imudrv.errors import InputError
 from imudrv.pipeline import Pipeline
@@ -325,7 +325,7 @@ def written(folder: Path, motion: list[dict[str, object]]) -> tuple[Path, Path]:
 
 def through_port(url: str) -> Records:
     """Increments of a port as the service makes them."""
-    pipeline = Pipeline(PROFILE, coefficients(NOMINAL), rate_filter("causal", LAYOUT.interval_ns))
+    pipeline = Pipeline(PROFILE, coefficients(NOMINAL), "causal")
     port, out = open_port(url, PROFILE), []
     try:
         while True:
@@ -339,7 +339,7 @@ def through_port(url: str) -> Records:
 @pytest.mark.parametrize("name", FOUR)
 def test_live_replayed_and_offline_give_the_same_bits(name: str, tmp_path: Path) -> None:
     run, capture = written(tmp_path, FOUR[name])
-    offline = Compensator(coefficients(NOMINAL), LAYOUT, rate_filter("causal", LAYOUT.interval_ns))
+    offline = Compensator(coefficients(NOMINAL), LAYOUT, "causal")
     expected = np.concatenate(list(Capture(capture, PROFILE).increments(offline, lambda _: None)))
     assert len(expected) >= 2500
     assert (expected["flags"] & Flag.SIZE_EFFECT != 0).mean() > 0.99

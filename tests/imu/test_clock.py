@@ -12,7 +12,6 @@ from imudrv.imu.clock import SLEW, STALL_EDGES_S, ClockModel
 from imudrv.imu.coefficients import Coefficients
 from imudrv.imu.compensation import Compensator
 from imudrv.imu.envelope import MAX_SKEW
-from imudrv.imu.rate_filter import rate_filter
 from imudrv.profiles import load
 from imudrv.records import INCREMENTS, PULSES, Flag, Records
 
@@ -409,7 +408,7 @@ def test_delayed_increments_get_the_stamps_of_their_samples(cuts: list[int]) -> 
     pulses["flags"][5_000] = Flag.MISSING_BEFORE
     stamps, locked = stamped(ClockModel(TAU), pulses)
     clock = ClockModel(TAU)
-    compensator = Compensator(COEFFICIENTS, layout, rate_filter("dither", TAU))
+    compensator = Compensator(COEFFICIENTS, layout, "dither")
     edges = [0, *sorted(min(c, len(pulses)) for c in cuts), len(pulses)]
     out = []
     for a, b in pairwise(edges):

@@ -3,11 +3,11 @@ import pytest
 from imudrv import Source
 from imudrv.errors import InputError
 from imudrv.ports import PortLostError, check_url, open_port
-from imudrv.ports.url import split, value
+from imudrv.url import split, value
 
 SERIAL_MISTAKES = [
     ("ttyUSB0", r"expected a URL that begins with serial://.*or a path like /dev/ttyUSB0"),
-    ("usb:///dev/ttyUSB0", r"expected a URL that begins with serial://.*got usb://"),
+    ("usb:///dev/ttyUSB0", r"expected a URL that begins with serial://.*got 'usb:///dev/ttyUSB0'"),
     ("serial://dev/ttyUSB0", r"serial:///dev/ttyUSB0 \(three slashes\), got 'dev/ttyUSB0'"),
     ("serial:///dev/ttyUSB0?baud=9600", r"baud: unknown key; did you mean baudrate\?"),
     ("serial:///dev/ttyUSB0?parity=strange", r"parity: expected 'none', .*got text 'strange'"),
@@ -54,10 +54,12 @@ def test_a_mistake_in_a_url_for_a_can_unit_is_reported_before_anything_is_opened
 
 
 @pytest.mark.parametrize("speed", ["0", "-1", "nan", "inf", "fast", "1e9", ""])
-def test_a_replay_has_a_speed_above_zero_or_max(speed, rs422, tmp_path):
+def test_a_replay_has_a_speed_or_max(speed, rs422, tmp_path):
     capture = tmp_path / "capture.raw"
     capture.write_bytes(bytes(44))
-    with pytest.raises(InputError, match=f"speed: expected max or a factor up to 1e\\+06, got '{speed}'"):
+    with pytest.raises(
+        InputError, match=f"speed: expected max or a number from 0.001 to 1e\\+06, got '{speed}'"
+    ):
         check_url(f"replay://{capture}?speed={speed}", rs422)
 
 
@@ -71,9 +73,8 @@ def test_a_simulated_unit_is_a_port_and_its_mistakes_are_reported_at_once(rs422,
 
 
 def test_a_valid_url_is_accepted_without_a_device(rs422, can_profile):
-    for url in ("/dev/no-such", "COM3", "serial:///dev/no-such?stopbits=2&parity=even", "socket://[::1]:1"):
-        if url != "COM3":
-            check_url(url, rs422)
+    for url in ("/dev/no-such", "serial:///dev/no-such?stopbits=2&parity=even", "socket://[::1]:1"):
+        check_url(url, rs422)
         assert split(url).scheme in ("serial", "socket")
     check_url("can://slcan//dev/no-such?tty_baudrate=3000000", can_profile)
 

@@ -6,7 +6,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from imudrv.errors import InputError
 from imudrv.records import MESSAGE
 from imudrv.sim.faults import Damage, Kind, MessageFaults, StreamFaults
 from imudrv.sim.scenario import Faults, Scenario
@@ -170,11 +169,6 @@ def test_a_cable_that_is_out_is_a_silence(faults: Callable[..., Faults]) -> None
     ):
         frames, stream, _ = send(kind, 100)
         assert stream == frames[:50].tobytes() + frames[70:].tobytes()
-
-
-def test_frames_without_times_are_refused(faults: Callable[..., Faults]) -> None:
-    with pytest.raises(InputError, match="n frames of 2 bytes or more and n times"):
-        StreamFaults(faults(), HEADER, 1).apply(frames_of(3), times(2))
 
 
 def messages_of(n: int) -> Any:

@@ -28,8 +28,9 @@ from imudrv.files import settings_file
 from imudrv.records import Records
 from imudrv.sim.capture import wire
 from imudrv.sim.links import pty, serial, tcp
-from imudrv.sim.live import MOST, Pace, PacedPlayback, Played, play, speed_of
+from imudrv.sim.live import MOST, Pace, PacedPlayback, Played, play
 from imudrv.sim.scenario import Scenario
+from imudrv.url import speed_of
 
 Make = Callable[..., Scenario]
 RS422 = profiles.load("imu50-rs422")
@@ -347,7 +348,7 @@ def test_identifiers_of_29_bits_are_sent_as_such(run: Scenario, player: Player) 
     profile = CAN.model_copy(update={"messages": messages})
     with can.Bus("wide", "virtual", ignore_config=True) as listener:
         player.start(run, profile, "can://virtual/wide", 2.0)
-        received = [listener.recv(GENEROUS_S) for _ in range(4)]
+        received = [listener.recv(DEADLINE_S) for _ in range(4)]
     sent = [(m.arbitration_id, m.is_extended_id) for m in received if m is not None]
     assert sent == [(0x18FF0150, True), (0x151, False), (0x152, False), (0x153, False)]
 
@@ -359,11 +360,11 @@ def test_identifiers_of_29_bits_are_sent_as_such(run: Scenario, player: Player) 
         ("can://virtual/x", RS422, "expected pty, a serial port or tcp:// for the profile imu50-rs422"),
         ("can://nonsense/x", CAN, "cannot be opened as a CAN bus"),
         ("/dev/no-such-port", RS422, "/dev/no-such-port: cannot be opened as a serial port"),
-        ("serial:///dev/x?colour=red", RS422, "expected pty, a serial port's path"),
+        ("serial:///dev/x?colour=red", RS422, "colour: unknown key"),
         ("serial:///dev/x?baudrate=fast", RS422, "fast"),
         ("tcp://127.0.0.1:99999", RS422, "(?i)port"),
         ("tcp://192.0.2.1:5000", RS422, "cannot listen there"),
-        ("udp://127.0.0.1:5000", RS422, "expected pty, a serial port's path"),
+        ("udp://127.0.0.1:5000", RS422, "begins with serial://, tcp://, or a path"),
     ],
 )
 def test_an_invalid_target_is_refused(

@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 
 from imudrv.errors import InputError
+from imudrv.imu.coefficients import Coefficients
 from imudrv.nav.earth import earth_rate_n
 from imudrv.sim.scenario import NOMINAL, Scenario
-from imudrv.sim.unit import STATUS_OVERFLOW, STATUS_WARM_UP, Chunk, TrueUnit, draw_true_unit, simulate
+from imudrv.sim.unit import STATUS_OVERFLOW, STATUS_WARM_UP, Chunk, draw_true_unit, simulate
 from imudrv.units import ARCSEC, DEG, DEG_PER_H, DEG_PER_SQRT_H, PPM, UG, URAD
 
 Make = Callable[..., Scenario]
@@ -58,7 +59,7 @@ def run(scenario: Scenario, interval_ns: int = MS, chunk: int = 65_536) -> Chunk
     return Chunk(np.concatenate([c.pulses for c in chunks]), np.concatenate([c.truth for c in chunks]))
 
 
-def size_effect(unit: TrueUnit, got: Chunk) -> np.ndarray:
+def size_effect(unit: Coefficients, got: Chunk) -> np.ndarray:
     """Integral of `a_i . Omega r_i` by the formula of the compensation, from true rates."""
     tau = 1e-3
     w1 = got.truth["omega_ib_b"]
@@ -278,7 +279,7 @@ def test_residuals_have_their_sigma_and_nothing_else_changes(scenario: Make) -> 
     units = [draw_true_unit(scenario(REST, seed=seed, unit={"residuals": sigmas})) for seed in range(200)]
     exact = draw_true_unit(scenario(REST))
 
-    def sigma(of: Callable[[TrueUnit], Any]) -> float:
+    def sigma(of: Callable[[Coefficients], Any]) -> float:
         return float(np.std([of(u) - of(exact) for u in units]))
 
     # 600 draws (1200 of the misalignments): four sigma are 4 / sqrt(1200)

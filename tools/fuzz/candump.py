@@ -5,7 +5,7 @@ import io
 import numpy as np
 from numpy.random import Generator
 
-from imudrv.records import Records
+from imudrv.records import EXTENDED, Records
 from imudrv.wire.candump import LONGEST_LINE, CandumpDecoder, format_candump
 
 from .properties import Cuts, Setup, feed_all, whole_as_pieces

@@ -10,7 +10,7 @@ from numpy.random import Generator
 from imudrv.calibration import Calibration, coefficients
 from imudrv.files import settings_file
 from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import NAMES, rate_filter
+from imudrv.imu.rate_filter import NAMES
 from imudrv.imu.sequence import SequenceTracker
 from imudrv.records import Records
 from imudrv.sim import scenario
@@ -33,7 +33,6 @@ CALIBRATION: Final = scenario.NOMINAL.model_dump(mode="json", exclude_none=True)
     "provenance": {"runs": ["a", "b"], "sigma": {"x": 0.1}},
 }
 COEFFICIENTS: Final = coefficients(settings_file.parse(CALIBRATION, Calibration, "a unit"))
-FILTERS: Final = {name: rate_filter(name, 1_000_000) for name in NAMES}
 
 
 def make_chain(rng: Generator) -> tuple[Setup, bytes]:
@@ -55,7 +54,7 @@ def check_chain(setup: Setup, data: bytes, cuts: Cuts) -> None:
 
     def run(parts: list[bytes]) -> list[Records]:
         decoder, tracker = CaptureDecoder(layout), SequenceTracker(layout)
-        compensator, out = Compensator(numbers, layout, FILTERS[filter_name]), []
+        compensator, out = Compensator(numbers, layout, filter_name), []
         for feed in (*(functools.partial(decoder.feed, part) for part in parts), decoder.close):
             out.append(compensator.feed(tracker.feed(feed())))
             assert tracker.counts.closes, f"{tracker.counts} does not add up"

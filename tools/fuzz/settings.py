@@ -23,7 +23,7 @@ from imudrv.site import Site
 from imudrv.wire.can import CanAssembler
 from imudrv.wire.stream import StreamDecoder
 
-from .chain import CALIBRATION, FILTERS, require_finite
+from .chain import CALIBRATION, require_finite
 from .properties import Cuts, Setup
 from .random_input import mutated, pick, small_number
 from .units import SERIAL, SHIPPED, TEXTS, transmit
@@ -115,7 +115,7 @@ def use(settings: model.Model) -> None:
     elif isinstance(settings, Calibration):
         layout = SHIPPED[SERIAL[0]]
         pulses = SequenceTracker(layout).feed(StreamDecoder(layout).feed(transmit(rng, layout, 9)).frames)
-        require_finite(Compensator(coefficients(settings), layout, FILTERS["causal"]).feed(pulses))
+        require_finite(Compensator(coefficients(settings), layout).feed(pulses))
     elif isinstance(settings, Profile):
         layout = settings.layout()
         decoder, tracker = (CanAssembler if layout.can else StreamDecoder)(layout), SequenceTracker(layout)

@@ -19,4 +19,4 @@ if __name__ == "__main__":
             received.extend(receiver)
         received.extend(receiver)  # what came in the last moment
     np.save(sys.argv[2], np.concatenate(received))
-    print(f"lost {receiver.lost}, {receiver.rejected_bytes} bytes rejected")
+    print(f"lost {receiver.counts.lost}, {receiver.rejected_bytes} bytes rejected")

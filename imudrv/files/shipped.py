@@ -1,0 +1,44 @@
+"""Settings files that come with the package, found by name; a user's own is found by its path."""
+
+import os
+from pathlib import Path
+
+from imudrv.errors import InputError
+
+
+def names(folder: Path) -> list[str]:
+    """Return the names of the files in a folder of the package."""
+    return sorted(path.stem for path in folder.glob("*.yaml"))
+
+
+def find(kind: str, name_or_path: str | os.PathLike[str], folder: Path) -> Path:
+    """Return the path of a file.
+
+    Parameters
+    ----------
+    kind : str
+        What it is, for messages: ``profile``.
+    name_or_path : path-like
+        Name of a file in the folder, or path of any file.
+    folder : Path
+        Folder of the package.
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    InputError
+        It is neither.
+    """
+    name = os.fspath(name_or_path)
+    known = names(folder)
+    if name in known:
+        return folder / f"{name}.yaml"
+    if not Path(name).exists():
+        raise InputError(
+            f"{kind} {name!r}: expected one of {', '.join(known)}, "
+            f"or the path of a {kind} file; there is no such file"
+        )
+    return Path(name)
