@@ -8,6 +8,8 @@ import errno
 import os
 import select
 import socket
+import struct
+import sys
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
@@ -21,7 +23,8 @@ from serial.tools.list_ports import comports
 from imudrv.errors import InputError
 from imudrv.files import settings_file
 from imudrv.hostclock import now_ns
-from imudrv.ports.base import Port, PortLostError
+from imudrv.ports.base import LineErrors, Port, PortLostError
+from imudrv.ports.holders import holders
 from imudrv.ports.url import Url, require_transport, value
 from imudrv.profiles.schema import Profile, SerialLine
 from imudrv.records import Arrival, Source
@@ -39,7 +42,10 @@ _PARITY: Final = {
 }
 _SHOWN_PORTS: Final = 10
 _SYSTEM_ERRORS: tuple[type[Exception], ...] = (OSError,)
+_TIOCGICOUNT: Final = 0x545D  # Linux, asm-generic/ioctls.h
+_COUNTS: Final = struct.Struct("20i")  # struct serial_icounter_struct, linux/serial.h
 if os.name == "posix":
+    import fcntl
     import termios
 
     _SYSTEM_ERRORS += (termios.error,)
@@ -102,7 +108,9 @@ def explain(device: str, error: OSError) -> str:
         case errno.EACCES | errno.EPERM:
             return f"no permission for {device}; {_who_may(device)}"
         case errno.EBUSY | errno.EAGAIN:
-            return f"another program has {device} open; end it (`fuser -v {device}` names it)"
+            users, _ = holders(Path(device).resolve())
+            who = ", ".join(users) or f"another program (`sudo fuser -v {device}` names it)"
+            return f"{device} is open in {who}: end that program"
         case _:
             return f"cannot open {device}: {error.strerror or error}"
 
@@ -144,6 +152,17 @@ class DescriptorPort(Port):
         if ready and not data:
             raise PortLostError(f"{self.url}: the other end has gone")
         return Arrival(t_ns, data)
+
+    def line_errors(self) -> LineErrors:
+        """See `Port.line_errors`."""
+        if sys.platform != "linux" or self._closed:
+            return LineErrors()
+        try:
+            counts = fcntl.ioctl(self._ready[0], _TIOCGICOUNT, bytes(_COUNTS.size))
+        except OSError:  # a pty, a socket, or a driver that does not count
+            return LineErrors()
+        framing, overrun, parity, _, buffer_overrun = _COUNTS.unpack(counts)[6:11]
+        return LineErrors(framing, parity, overrun + buffer_overrun)
 
     def close(self) -> None:
         """See `Port.close`."""
@@ -212,6 +231,10 @@ def _open(url: str, target: str, line: SerialLine) -> Port:
         raise PortLostError(f"{url}: {explain(target, reason)}") from error
     if os.name != "posix" or not isinstance(device, serial.Serial) or target.startswith("spy:"):
         return PyserialPort(url, device)
+    if not Path(target).resolve().is_relative_to("/dev/pts"):  # both ends of a pty keep the flag alive
+        with suppress(OSError):
+            # Beside pyserial's advisory lock, which `cat` does not ask for.
+            fcntl.ioctl(device.fileno(), termios.TIOCEXCL)
     with suppress(ValueError, OSError, NotImplementedError):  # not supported by ptys and some drivers
         device.set_low_latency_mode(True)
     return DescriptorPort(url, device)

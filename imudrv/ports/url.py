@@ -1,6 +1,8 @@
 """Parts of a URL, and checks common to all ports."""
 
+import os
 import re
+from pathlib import Path
 from typing import Final, NamedTuple
 from urllib.parse import parse_qsl
 
@@ -30,6 +32,11 @@ class Url(NamedTuple):
     scheme: str
     address: str
     options: dict[str, str]
+
+    @property
+    def device(self) -> Path | None:
+        """Device file of a serial port, where the system has device files."""
+        return Path(self.address) if self.scheme == "serial" and os.name == "posix" else None
 
 
 def split(text: str) -> Url:

@@ -1,5 +1,8 @@
 import os
 import socket
+import struct
+import subprocess
+import sys
 import termios
 import threading
 import tty
@@ -118,8 +121,34 @@ def test_a_port_pulled_while_a_read_waits_is_lost(line, rs422, opened):
 
 def test_a_port_that_another_one_has_open_is_busy(line, rs422, opened):
     opened(line.path, rs422)
-    with pytest.raises(PortLostError, match=r"another program has /dev/pts/.* open; end it \(`fuser -v"):
+    with pytest.raises(PortLostError, match=r"/dev/pts/.* is open in another program \(`sudo fuser -v"):
         open_port(line.path, rs422)
+
+
+def test_the_program_that_has_a_port_open_is_named(line, rs422):
+    program = (
+        f"import serial, sys; line = serial.Serial({line.path!r}, exclusive=True); "
+        "print(flush=True); sys.stdin.read()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as other:
+        other.stdout.readline()
+        with pytest.raises(PortLostError, match=rf"is open in \S+ \(process {other.pid}\)"):
+            open_port(line.path, rs422)
+        other.communicate(b"")
+
+
+def test_errors_that_the_driver_has_counted_are_reported_and_a_pty_counts_none(
+    line, rs422, opened, monkeypatch
+):
+    port = opened(line.path, rs422)
+    before = port.line_errors()
+    assert not any(before)
+    # struct serial_icounter_struct of linux/serial.h: cts dsr rng dcd rx tx frame overrun parity brk buf_overrun
+    counts = struct.pack("20i", 0, 0, 0, 0, 9000, 0, 12, 3, 4, 7, 2, *[0] * 9)
+    monkeypatch.setattr("imudrv.ports.serial.fcntl.ioctl", lambda fd, request, room: counts)
+    assert str(port.line_errors().since(before)) == "12 framing errors, 4 parity errors, 5 overruns"
 
 
 def test_a_closed_port_is_closed_once_lost_when_read_and_free_for_others(line, rs422, opened):
