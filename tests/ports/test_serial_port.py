@@ -145,7 +145,7 @@ def test_errors_that_the_driver_has_counted_are_reported_and_a_pty_counts_none(
     port = opened(line.path, rs422)
     before = port.line_errors()
     assert not any(before)
-    # struct serial_icounter_struct of linux/serial.h: cts dsr rng dcd rx tx frame overrun parity brk buf_overrun
+    # linux/serial.h: cts, dsr, rng, dcd, rx, tx, frame, overrun, parity, brk, buf_overrun, reserved
     counts = struct.pack("20i", 0, 0, 0, 0, 9000, 0, 12, 3, 4, 7, 2, *[0] * 9)
     monkeypatch.setattr("imudrv.ports.serial.fcntl.ioctl", lambda fd, request, room: counts)
     assert str(port.line_errors().since(before)) == "12 framing errors, 4 parity errors, 5 overruns"
