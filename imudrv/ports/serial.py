@@ -115,6 +115,20 @@ def explain(device: str, error: OSError) -> str:
             return f"cannot open {device}: {error.strerror or error}"
 
 
+def take_exclusively(descriptor: int) -> None:
+    """Refuse the line to programs that open it later, where the driver can.
+
+    Pyserial's lock is advisory: `cat`, which does not ask for it, would take a part of the bytes.
+
+    Parameters
+    ----------
+    descriptor : int
+        File descriptor of the open line.
+    """
+    with suppress(OSError):
+        fcntl.ioctl(descriptor, termios.TIOCEXCL)
+
+
 class DescriptorPort(Port):
     """Device with a file descriptor; one read of it is one arrival.
 
@@ -231,10 +245,8 @@ def _open(url: str, target: str, line: SerialLine) -> Port:
         raise PortLostError(f"{url}: {explain(target, reason)}") from error
     if os.name != "posix" or not isinstance(device, serial.Serial) or target.startswith("spy:"):
         return PyserialPort(url, device)
-    if not Path(target).resolve().is_relative_to("/dev/pts"):  # both ends of a pty keep the flag alive
-        with suppress(OSError):
-            # Beside pyserial's advisory lock, which `cat` does not ask for.
-            fcntl.ioctl(device.fileno(), termios.TIOCEXCL)
+    if not Path(target).resolve().is_relative_to("/dev/pts"):  # the other end of a pty keeps the flag alive
+        take_exclusively(device.fileno())
     with suppress(ValueError, OSError, NotImplementedError):  # not supported by ptys and some drivers
         device.set_low_latency_mode(True)
     return DescriptorPort(url, device)

@@ -1,3 +1,4 @@
+import fcntl
 import os
 import socket
 import struct
@@ -16,7 +17,7 @@ from imudrv import Source
 from imudrv.errors import InputError
 from imudrv.hostclock import now_ns
 from imudrv.ports import PortLostError, open_port
-from imudrv.ports.serial import DescriptorPort, PyserialPort, explain
+from imudrv.ports.serial import DescriptorPort, PyserialPort, explain, take_exclusively
 
 MANY = bytes(range(256)) * 12  # less than the 4 KiB that a pty holds; has every byte that a terminal may eat
 
@@ -25,9 +26,9 @@ class Line:
     """A pty: we hold the unit's end, the driver gets the other one by its path."""
 
     def __init__(self) -> None:
-        self.unit, self._driver = os.openpty()
-        tty.setraw(self._driver)
-        self.path = os.ttyname(self._driver)
+        self.unit, self.descriptor = os.openpty()
+        tty.setraw(self.descriptor)
+        self.path = os.ttyname(self.descriptor)
 
     def pull(self) -> None:
         if self.unit >= 0:
@@ -36,7 +37,7 @@ class Line:
 
     def close(self) -> None:
         self.pull()
-        os.close(self._driver)
+        os.close(self.descriptor)
 
 
 @pytest.fixture
@@ -137,6 +138,18 @@ def test_the_program_that_has_a_port_open_is_named(line, rs422):
         with pytest.raises(PortLostError, match=rf"is open in \S+ \(process {other.pid}\)"):
             open_port(line.path, rs422)
         other.communicate(b"")
+
+
+def test_a_line_is_taken_exclusively_but_not_a_pty_which_its_other_end_would_keep_taken(line, rs422, opened):
+    def is_exclusive(descriptor):
+        return bool(struct.unpack("i", fcntl.ioctl(descriptor, 0x80045440, bytes(4)))[0])  # TIOCGEXCL
+
+    opened(line.path, rs422)
+    assert not is_exclusive(line.descriptor)
+    take_exclusively(line.descriptor)
+    assert is_exclusive(line.descriptor)
+    with open("/dev/null") as null:
+        take_exclusively(null.fileno())  # has no such flag
 
 
 def test_errors_that_the_driver_has_counted_are_reported_and_a_pty_counts_none(
