@@ -10,6 +10,7 @@ import numpy as np
 
 from imudrv import profiles
 from imudrv.calibration import Calibration, coefficients, read_calibration
+from imudrv.diagnosis import best_profile, find_mismatch, sequence_fault
 from imudrv.errors import InputError
 from imudrv.imu.clock import ClockModel
 from imudrv.imu.compensation import Compensator
@@ -59,6 +60,8 @@ class Capture:
         Layout of the profile.
     tracker : SequenceTracker
         Its `counts` are those of the samples read so far; each reading of the file begins anew.
+    sequence_fault : str
+        Why most good frames read so far do not continue the counter; empty if they do.
 
     Raises
     ------
@@ -99,12 +102,22 @@ class Capture:
             raise InputError(
                 f"{path}: --channel {channel}: expected a candump log, got {kind}; leave --channel out"
             )
-        self.tracker = SequenceTracker(self.layout)
+        self._begin()
         self._channel = channel
         self._decoder: CaptureDecoder | FrameDecoder = FrameDecoder(self.layout)
 
     def __repr__(self) -> str:
         return f"<Capture {self.path}, {self.profile.name}, {self.tracker.counts.frames} samples read>"
+
+    def _begin(self) -> None:
+        self.tracker = SequenceTracker(self.layout)
+        self._gaps = 0
+        self._counters = np.zeros(0, np.int64)
+
+    @property
+    def sequence_fault(self) -> str:
+        """See the class."""
+        return sequence_fault(self.tracker.counts, self._gaps, self._counters)
 
     @property
     def rejected(self) -> dict[Reason, RejectedRuns]:
@@ -139,13 +152,17 @@ class Capture:
             The whole file held no frame of the profile; the message names the shipped profile that fits, if
             one does. Or a log has several channels and none was chosen, or not the chosen one.
         """
-        self.tracker = SequenceTracker(self.layout)
+        self._begin()
         for frames in self._frames(advance):
-            yield self.tracker.feed(frames)
+            if not len(self._counters):
+                self._counters = frames["counter"].copy()
+            pulses = self.tracker.feed(frames)
+            self._gaps += int(np.count_nonzero(pulses["flags"] & Flag.MISSING_BEFORE))
+            yield pulses
         if self.tracker.counts.frames == 0:
             raise InputError(
                 f"{self.path}: expected frames of {self.layout.name}, "
-                f"got none in {self.size} bytes{self._hint()}"
+                f"got none in {self.size} bytes: {self._mismatch()}"
             )
 
     def increments(self, compensator: Compensator, advance: Advance = _no_progress) -> Iterator[Records]:
@@ -204,14 +221,15 @@ class Capture:
         if self._log is not None:
             self._log.check_channel(str(self.path), "--channel ")
 
-    def _hint(self) -> str:
-        if self.recording is None:
-            for name in profiles.shipped():
-                layout = profiles.load(name).layout()
-                decoder = CaptureDecoder(layout, self._channel)
-                if layout.name != self.layout.name and len(decoder.feed(self._head)):
-                    return f"; its beginning has frames of {name}: try --profile {name}"
-        return "; is it the right file, and the right --profile?"
+    def _mismatch(self) -> str:
+        """Say what the beginning of the file holds instead of frames, and which shipped profile fits it."""
+        log, _ = CandumpDecoder(self._channel).feed(self._head)
+        shipped = [profiles.load(name) for name in profiles.shipped()]
+        mismatch = find_mismatch(self.profile, log if self.layout.can else self._head, shipped)
+        fitting = mismatch.fitting or best_profile(shipped, self._head if self.layout.can else log)
+        if fitting is None:
+            return f"{mismatch.found}; is it the right file, and the right --profile?"
+        return f"{mismatch.found}; this looks like {fitting.name}: try --profile {fitting.name}"
 
 
 def compensate(

@@ -1,6 +1,7 @@
 """URLs of ports, outputs and simulated lines: parts, options, settings of a serial line."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 from urllib.parse import parse_qsl, urlsplit
 
@@ -35,6 +36,11 @@ class Url(NamedTuple):
     scheme: str
     address: str
     options: dict[str, str]
+
+    @property
+    def device(self) -> Path | None:
+        """Device file of a serial port."""
+        return Path(self.address) if self.scheme == "serial" else None
 
 
 def split(text: str, schemes: Sequence[str] = PORTS) -> Url:

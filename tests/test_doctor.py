@@ -25,6 +25,7 @@ from imudrv.doctor.verdict import Finding, Verdict
 from imudrv.errors import InputError
 from imudrv.files.settings_file import parse
 from imudrv.ports import Arrival, Port, PortEndedError
+from imudrv.ports.base import LineErrors
 from imudrv.profiles.schema import Profile, SerialLine
 from imudrv.records import MESSAGE, Reason, Source
 from imudrv.sim.capture import wire
@@ -132,7 +133,8 @@ def test_for_a_wrong_profile_the_right_one_is_named(playing: Any) -> None:
     steps = examined(playing(ACC), "imu50-rs422", lambda steps: "looks like" in steps["data"].found)
     data = steps["data"]
     assert data.verdict is Verdict.FAIL
-    assert "sync EB 90 found" in data.found
+    assert "bytes, no frame of imu50-rs422: sync EB 90 seen" in data.found
+    assert "times, check never right; this" in data.found
     assert data.found.endswith("this looks like imu50-rs422-acc at 460800")
     assert data.fix == "use --profile imu50-rs422-acc"
 
@@ -362,7 +364,10 @@ def test_for_a_unit_with_another_can_profile_the_right_one_is_named(
     playing(CANFD, bus)
     steps = examined(bus, "imu50-can", lambda steps: "looks like" in steps["data"].found)
     assert steps["data"].verdict is Verdict.FAIL
-    assert steps["data"].found == "0 messages of imu50-can, no complete sample: this looks like imu50-canfd"
+    assert steps["data"].found == (
+        "0 messages, no frame of imu50-can: 0 messages with its identifiers, no complete sample; "
+        "this looks like imu50-canfd"
+    )
     assert steps["data"].fix == "use --profile imu50-canfd"
 
 
@@ -397,8 +402,21 @@ def test_a_wrong_crc_is_distinguished_from_a_wrong_frame() -> None:
     frames[43::44] = bytes(b ^ 1 for b in frames[43::44])
     summary = diagnosis.decode_traffic(RS422, bytes(frames))
     assert Reason.CHECK_FAILED in summary.rejected
-    step = traffic.mismatch(RS422, summary, None, True)
-    assert "sync EB 90 found 100 times, no correct CRC" in step.found
+    step = traffic.check_mismatch(diagnosis.Mismatch(RS422, summary, None), True)
+    assert "sync EB 90 seen 100 times, check never right" in step.found
+
+
+def test_errors_that_the_driver_counts_are_a_step_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    class ErringLine(FakeLine):
+        def line_errors(self) -> LineErrors:
+            return LineErrors(framing=0 if self._pieces else 120)
+
+    monkeypatch.setattr(examination, "open_port", lambda url, _: ErringLine(url, 1, 2, RS422))
+    steps = by_name(examine("rfc2217://box:1", "imu50-rs422", 0.1))
+    assert steps["line errors"].verdict is Verdict.FAIL
+    assert steps["line errors"].found == "120 framing errors"
+    assert "baud rate" in steps["line errors"].fix
+    assert traffic.check_line_errors(LineErrors(overrun=2)).verdict is Verdict.WARN
 
 
 def test_a_fault_of_the_unit_and_another_rate_are_reported() -> None:

@@ -211,6 +211,8 @@ class SessionController:
 
     def _feed(self, engine: Engine, batch: Batch) -> tuple[Event, ...]:
         """Feed samples to the engine; faults and temperatures once a second, or when the faults change."""
+        if self._service.port_state.name == "wrong rate":
+            return ()  # their intervals are wrong; afterwards the engine finds the gap
         events: tuple[Event, ...] = ()
         if len(batch.pulses):
             newest = batch.pulses[-1]

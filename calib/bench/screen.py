@@ -28,6 +28,10 @@ NO_FRAMES: Final = message("no_frames")
 """Headline while the data contain no frame of the profile."""
 
 
+WRONG_RATE: Final = message("wrong_rate")
+"""Headline while the unit sends at another rate than its profile's."""
+
+
 _OTHER_ROWS: Final = 8
 """Rows besides headline, hints and reasons; one stays free for terminals that scroll after the last row."""
 
@@ -59,7 +63,7 @@ _STYLES: Final = {
 
 
 def with_port_state(view: View, state: LineState) -> View:
-    """Add a fault of the line to a view; without samples it becomes the headline.
+    """Add a fault of the line to a view, and make it the headline.
 
     Parameters
     ----------
@@ -75,7 +79,7 @@ def with_port_state(view: View, state: LineState) -> View:
     """
     if not state.trouble:
         return view
-    headlines = {"streaming": view.headline, "unreadable": NO_FRAMES}
+    headlines = {"unreadable": NO_FRAMES, "wrong rate": WRONG_RATE}
     headline = headlines.get(state.name, NO_DATA)
     return replace(view, headline=headline, reasons=(verbatim(str(state)), *view.reasons))
 
@@ -235,7 +239,11 @@ def _time(seconds: float | None) -> str:
 
 def _banner(view: View, width: int, height: int, ascii_only: bool) -> RenderableType:
     refused = view.reasons and view.phase in (Phase.PREFLIGHT, Phase.PLACE, Phase.VERDICT)
-    style = "white on red" if refused or view.headline in (NO_DATA, NO_FRAMES) else _STYLES[view.phase]
+    style = (
+        "white on red"
+        if refused or view.headline in (NO_DATA, NO_FRAMES, WRONG_RATE)
+        else _STYLES[view.phase]
+    )
     headline, inside = english(view.headline), width - 2
     scale, lines = block_letters.fitted(headline, inside, height)
     if ascii_only and scale < 2:

@@ -1,10 +1,12 @@
 """The capture that `decode` and `compensate` read, and the summary of its losses."""
 
 import argparse
+import sys
 from pathlib import Path
 
 from imudrv.capture import Capture
 from imudrv.cli.arguments import add_profile, message_stream
+from imudrv.terminal import BAD_INPUT, OK
 
 
 def add_capture(parser: argparse.ArgumentParser) -> None:
@@ -20,8 +22,8 @@ def open_capture(arguments: argparse.Namespace) -> Capture:
     return Capture(arguments.capture, arguments.profile, arguments.channel)
 
 
-def print_losses(capture: Capture, output: Path) -> None:
-    """Print what was read, and which samples and bytes were lost or rejected."""
+def print_losses(capture: Capture, output: Path) -> int:
+    """Print what was read, and which samples and bytes were lost or rejected; return the exit code."""
     stream = message_stream(output)
     print(f"{capture.path}: {capture.layout.name}, {capture.size} bytes -> {output}", file=stream)
     print(f"  {capture.tracker.counts}", file=stream)
@@ -32,3 +34,7 @@ def print_losses(capture: Capture, output: Path) -> None:
         print(f"  {name}: {rejected.runs} x, {rejected.length} in all, at {first}{more}", file=stream)
     for channel, messages in list(capture.channels.items())[1:]:
         print(f"  ignored: {messages} messages of channel {channel}", file=stream)
+    if fault := capture.sequence_fault:
+        print(f"error: {capture.path}: {fault}", file=sys.stderr)
+        return BAD_INPUT
+    return OK

@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_output(parser, "NAME.csv, NAME.npz or NAME.i50n; - for csv on standard output")
 
 
-def run(arguments: argparse.Namespace) -> None:
+def run(arguments: argparse.Namespace) -> int:
     """Write the compensated increments of a capture as a table."""
     require_other(arguments.output, arguments.capture, arguments.profile, arguments.calibration)
     capture = open_capture(arguments)
@@ -48,7 +48,7 @@ def run(arguments: argparse.Namespace) -> None:
     ):
         for increments in capture.increments(compensator, advance):
             rows.write(increment_columns(increments))
-    print_losses(capture, arguments.output)
+    code = print_losses(capture, arguments.output)
     stream = message_stream(arguments.output)
     size_effect = (
         "compensated" if calibration.size_effect else "not compensated: the calibration has no sensing points"
@@ -58,3 +58,4 @@ def run(arguments: argparse.Namespace) -> None:
         f"  size effect {size_effect}; rate filter {arguments.rate_filter}, delay {compensator.lag} samples",
         file=stream,
     )
+    return code

@@ -8,6 +8,7 @@ import errno
 import os
 import select
 import socket
+import struct
 import termios
 from collections.abc import Callable
 from contextlib import suppress
@@ -21,7 +22,8 @@ from serial.tools.list_ports import comports
 
 from imudrv.errors import InputError
 from imudrv.hostclock import now_ns
-from imudrv.ports.base import Port, PortLostError, require_transport
+from imudrv.ports.base import LineErrors, Port, PortLostError, require_transport
+from imudrv.ports.holders import holders
 from imudrv.profiles.schema import Profile, SerialLine
 from imudrv.records import Arrival, Source
 from imudrv.url import Url, device_path, host_and_port, serial_settings
@@ -31,6 +33,8 @@ _SLICE_S: Final = 0.02
 """Longest wait inside pyserial, s; a change of its timeout would set up an open line again."""
 _CONNECT_S: Final = 1.0
 _SHOWN_PORTS: Final = 10
+_TIOCGICOUNT: Final = 0x545D  # Linux, asm-generic/ioctls.h
+_COUNTS: Final = struct.Struct("20i")  # struct serial_icounter_struct, linux/serial.h
 
 
 def prepare(url: Url, profile: Profile) -> Callable[[], Port]:
@@ -88,9 +92,25 @@ def explain(device: str, error: OSError) -> str:
         case errno.EACCES | errno.EPERM:
             return f"no permission for {device}; {_who_may(device)}"
         case errno.EBUSY | errno.EAGAIN:
-            return f"another program has {device} open; end it (`fuser -v {device}` names it)"
+            users, _ = holders(Path(device).resolve())
+            who = ", ".join(users) or f"another program (`sudo fuser -v {device}` names it)"
+            return f"{device} is open in {who}: end that program"
         case _:
             return f"cannot open {device}: {error.strerror or error}"
+
+
+def take_exclusively(descriptor: int) -> None:
+    """Refuse the line to programs that open it later, where the driver can.
+
+    Pyserial's lock is advisory: `cat`, which does not ask for it, would take a part of the bytes.
+
+    Parameters
+    ----------
+    descriptor : int
+        File descriptor of the open line.
+    """
+    with suppress(OSError):
+        fcntl.ioctl(descriptor, termios.TIOCEXCL)
 
 
 class DescriptorPort(Port):
@@ -127,6 +147,17 @@ class DescriptorPort(Port):
         if ready and not data:
             raise PortLostError(f"{self.url}: the other end has gone")
         return Arrival(t_ns, data)
+
+    def line_errors(self) -> LineErrors:
+        """See `Port.line_errors`."""
+        if sys.platform != "linux" or self._closed:
+            return LineErrors()
+        try:
+            counts = fcntl.ioctl(self._ready[0], _TIOCGICOUNT, bytes(_COUNTS.size))
+        except OSError:  # a pty, a socket, or a driver that does not count
+            return LineErrors()
+        framing, overrun, parity, _, buffer_overrun = _COUNTS.unpack(counts)[6:11]
+        return LineErrors(framing, parity, overrun + buffer_overrun)
 
     def close(self) -> None:
         """See `Port.close`."""
@@ -187,6 +218,8 @@ def _open(url: str, target: str, settings: dict[str, Any]) -> Port:
         raise PortLostError(f"{url}: {explain(target, reason)}") from error
     if not isinstance(device, serial.Serial) or target.startswith("spy:"):
         return PyserialPort(url, device)
+    if not Path(target).resolve().is_relative_to("/dev/pts"):  # the other end of a pty keeps the flag alive
+        take_exclusively(device.fileno())
     with suppress(ValueError, OSError, NotImplementedError):  # not supported by ptys and some drivers
         device.set_low_latency_mode(True)
     return DescriptorPort(url, device)

@@ -24,7 +24,7 @@ from imudrv.diagnosis import LineState
 from imudrv.hostclock import now_ns
 from imudrv.pipeline import Pipeline, PipelineOutput
 from imudrv.ports import PortEndedError
-from imudrv.records import INCREMENTS, PULSES, Arrival, Source
+from imudrv.records import INCREMENTS, PULSES, Arrival, Flag, Source
 from imudrv.service.calibration_watch import CalibrationWatch
 from imudrv.service.events import EventLog
 from imudrv.service.latency import Latency
@@ -51,6 +51,7 @@ from imudrv.wire.datagram import encode
 
 POLL_NS: Final = NS_PER_S // 50
 """Time between two rounds of housekeeping, and the longest wait for data."""
+_INVALID: Final = np.uint32(~Flag.VALID & 0xFFFF_FFFF)
 
 
 class Service:
@@ -231,6 +232,8 @@ class Service:
         pulses, increments = output
         if not len(pulses) and not len(increments):
             return
+        if self._port.state.name == "wrong rate":
+            increments["flags"] &= _INVALID  # they do not cover the interval that they name
         batch = Batch(pulses, increments, encode(increments, self._port.source))
         for sink in self._sinks:
             sink.publish(batch)

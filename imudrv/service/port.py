@@ -6,11 +6,14 @@ from typing import Final
 
 from imudrv.diagnosis import LineState, LineWatch
 from imudrv.ports import Port, PortEndedError, PortLostError, check_url, open_port
+from imudrv.ports.base import LineErrors
 from imudrv.profiles.schema import Profile
 from imudrv.records import Arrival, Source
 from imudrv.service.events import EventLog
+from imudrv.service.mismatch_search import MismatchSearch
 from imudrv.service.status import PortStatus
 from imudrv.units import NS_PER_S
+from imudrv.url import split
 
 BACK_OFF_S: Final = (0.1, 0.2, 0.4, 0.8)
 """Delays before further attempts to open the port; the last one is repeated."""
@@ -58,6 +61,8 @@ class PortSupervisor:
         self.state = LineState("connecting")
         self._port: Port | None = None
         self._watch = LineWatch(profile, self._in_real_time, clock())
+        self._search = MismatchSearch(profile, split(url).device)
+        self._errors = LineErrors()  # counted by the driver while the data was good
         self._reconnects = 0
         self._attempts, self._next_attempt_ns = 0, 0
 
@@ -102,23 +107,33 @@ class PortSupervisor:
 
     def decoded(self, arrival: Arrival, samples: int) -> None:
         """Take note of the number of samples that an arrival completed."""
-        self._watch.arrived(len(arrival.data), samples, self._clock())
+        self._watch.arrived(arrival.data, samples, self._clock())
 
     def check_rate(self, expected: int, now_ns: int) -> None:
         """Check the rate; call it about once a second with the number of samples by the unit's counter."""
-        if self._port is not None:
-            self._watch.counted(expected, now_ns)
-
-    def check_line(self, now_ns: int) -> None:
-        """Report a line that has become silent, unreadable or good again."""
         if self._port is None:
             return
-        before, self.state = self.state, self._watch.state(now_ns)
-        if self.state == before:
+        self._watch.counted(expected, now_ns)
+        if self.state.name == "streaming":
+            self._errors = self._port.line_errors()
+
+    def check_line(self, now_ns: int) -> None:
+        """Report a line that has become silent, unreadable or good again, or whose rate is wrong."""
+        if self._port is None:
             return
-        if self.state.trouble:
-            self._events.failure(str(self.state))
-        elif before.name == "streaming":
+        before, state = self.state, self._watch.state(now_ns)
+        if state.name == "unreadable":
+            errors = self._port.line_errors().since(self._errors)
+            reason = self._search.poll(now_ns, lambda: self._watch.undecoded, errors)
+            state = state._replace(trouble=f"{state.trouble}: {reason}")
+        elif before.name == "unreadable":
+            self._search.clear()
+        self.state = state
+        if state == before:
+            return
+        if state.trouble:
+            self._events.failure(str(state))
+        elif before.name == "wrong rate":
             self._events.event("the rate is right again")
         else:
             self._events.event("the unit is back")
@@ -148,4 +163,6 @@ class PortSupervisor:
             self._events.event("port is back")
         self.state = LineState("streaming")
         self._watch = LineWatch(self._profile, self._in_real_time, self._clock())
+        self._search.clear()
+        self._errors = self._port.line_errors()
         return self._port

@@ -177,7 +177,7 @@ class Status:
 
     @property
     def failures(self) -> list[str]:
-        """Reasons why no samples are output or recorded."""
+        """Reasons why no valid samples are output, or none are recorded."""
         failures = []
         if self.port.state not in ("streaming", "ended"):
             failures.append(f"port {self.port.state}: {self.port.trouble or self.port.url}")
@@ -190,13 +190,11 @@ class Status:
     @property
     def warnings(self) -> list[str]:
         """What a person should look at although samples are output."""
-        is_streaming = self.port.state == "streaming"
-        warnings = [self.port.trouble] if is_streaming and self.port.trouble else []
-        warnings += [f"unit: {name}" for name in self.unit_status.faults]
+        warnings = [f"unit: {name}" for name in self.unit_status.faults]
         warnings += [f"{sink.url}: {sink.state}" for sink in self.sinks if not sink.healthy]
         if self.samples.lost_last_s:
             warnings.append(f"{self.samples.lost_last_s} samples lost in the last second")
-        if is_streaming and not self.clock.locked:
+        if self.port.state == "streaming" and not self.clock.locked:
             warnings.append("clock not locked yet")
         return warnings + self.notices
 

@@ -285,6 +285,16 @@ def test_messages_of_the_service_about_the_port_are_shown_and_journaled(
     assert "!" not in text.splitlines()[-1]
 
 
+def test_nothing_is_accepted_while_the_rate_of_the_unit_is_not_that_of_its_profile(
+    session: Session, batches: list[Batch]
+) -> None:
+    wrong = LineState("wrong rate", "expected 1000 samples/s, the unit counts 500.0")
+    _, text = conducted(session, [*batches], port_states=[wrong] * 10 * len(batches))
+    assert "preflight: WRONG RATE: CHECK THE PROFILE | " in text
+    assert "! port wrong rate: expected 1000 samples/s, the unit counts 500.0" in text
+    assert not session.accepted
+
+
 def test_a_mistake_is_journaled_with_its_reasons_and_its_recording_is_kept(session: Session) -> None:
     scenario = technician_scenario(PROCEDURE, [Mistake("z-up", "short")], calibration=NOMINAL)
     _, text = conducted(session, performed(scenario))

@@ -152,7 +152,10 @@ def test_a_question_replaces_the_keys() -> None:
             "NO DATA: CHECK THE CABLE | ! port silent: nothing for 0.4 s",
         ),
         (LineState("unreadable", "no frame"), "NO FRAMES: CHECK THE PROFILE | ! port unreadable: no frame"),
-        (LineState("streaming", "expected 1000 samples/s"), "TURN IT: X UP | ! expected 1000 samples/s"),
+        (
+            LineState("wrong rate", "expected 1000 samples/s"),
+            "WRONG RATE: CHECK THE PROFILE | ! port wrong rate: expected 1000 samples/s",
+        ),
         (LineState("streaming"), "TURN IT: X UP"),
     ],
 )

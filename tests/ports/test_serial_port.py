@@ -1,5 +1,9 @@
+import fcntl
 import os
 import socket
+import struct
+import subprocess
+import sys
 import termios
 import threading
 import tty
@@ -15,7 +19,7 @@ from imudrv import Source
 from imudrv.errors import InputError
 from imudrv.hostclock import now_ns
 from imudrv.ports import PortLostError, open_port
-from imudrv.ports.serial import DescriptorPort, PyserialPort, explain
+from imudrv.ports.serial import DescriptorPort, PyserialPort, explain, take_exclusively
 
 MANY = bytes(range(256)) * 12  # less than the 4 KiB that a pty holds; has every byte that a terminal may eat
 
@@ -24,9 +28,9 @@ class Line:
     """A pty: we hold the unit's end, the driver gets the other one by its path."""
 
     def __init__(self) -> None:
-        self.unit, self._driver = os.openpty()
-        tty.setraw(self._driver)
-        self.path = os.ttyname(self._driver)
+        self.unit, self.descriptor = os.openpty()
+        tty.setraw(self.descriptor)
+        self.path = os.ttyname(self.descriptor)
 
     def pull(self) -> None:
         if self.unit >= 0:
@@ -35,7 +39,7 @@ class Line:
 
     def close(self) -> None:
         self.pull()
-        os.close(self._driver)
+        os.close(self.descriptor)
 
 
 @pytest.fixture
@@ -120,8 +124,46 @@ def test_a_port_pulled_while_a_read_waits_is_lost(line, rs422, opened):
 
 def test_a_port_that_another_one_has_open_is_busy(line, rs422, opened):
     opened(line.path, rs422)
-    with pytest.raises(PortLostError, match=r"another program has /dev/pts/.* open; end it \(`fuser -v"):
+    with pytest.raises(PortLostError, match=r"/dev/pts/.* is open in another program \(`sudo fuser -v"):
         open_port(line.path, rs422)
+
+
+def test_the_program_that_has_a_port_open_is_named(line, rs422):
+    program = (
+        f"import serial, sys; line = serial.Serial({line.path!r}, exclusive=True); "
+        "print(flush=True); sys.stdin.read()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as other:
+        other.stdout.readline()
+        with pytest.raises(PortLostError, match=rf"is open in \S+ \(process {other.pid}\)"):
+            open_port(line.path, rs422)
+        other.communicate(b"")
+
+
+def test_a_line_is_taken_exclusively_but_not_a_pty_which_its_other_end_would_keep_taken(line, rs422, opened):
+    def is_exclusive(descriptor):
+        return bool(struct.unpack("i", fcntl.ioctl(descriptor, 0x80045440, bytes(4)))[0])  # TIOCGEXCL
+
+    opened(line.path, rs422)
+    assert not is_exclusive(line.descriptor)
+    take_exclusively(line.descriptor)
+    assert is_exclusive(line.descriptor)
+    with open("/dev/null") as null:
+        take_exclusively(null.fileno())  # has no such flag
+
+
+def test_errors_that_the_driver_has_counted_are_reported_and_a_pty_counts_none(
+    line, rs422, opened, monkeypatch
+):
+    port = opened(line.path, rs422)
+    before = port.line_errors()
+    assert not any(before)
+    # linux/serial.h: cts, dsr, rng, dcd, rx, tx, frame, overrun, parity, brk, buf_overrun, reserved
+    counts = struct.pack("20i", 0, 0, 0, 0, 9000, 0, 12, 3, 4, 7, 2, *[0] * 9)
+    monkeypatch.setattr("imudrv.ports.serial.fcntl.ioctl", lambda fd, request, room: counts)
+    assert str(port.line_errors().since(before)) == "12 framing errors, 4 parity errors, 5 overruns"
 
 
 def test_a_closed_port_is_closed_once_lost_when_read_and_free_for_others(line, rs422, opened):
