@@ -103,6 +103,9 @@ class Flag(IntFlag):
     SIZE_EFFECT = 1 << 6
     CLOCK_UNLOCKED = 1 << 7
     WARM_UP = 1 << 8
+    GAP_BY_HOST_TIME = 1 << 9
+    GAP_LENGTH_UNKNOWN = 1 << 10
+    CLOCK_STEPPED = 1 << 11
 
 
 class Source(IntEnum):
@@ -111,6 +114,24 @@ class Source(IntEnum):
     HARDWARE = 0
     REPLAY = 1
     SIMULATOR = 2
+
+
+class Timebase(NamedTuple):
+    """From times of arrival, which never step, to UNIX time, which the host's clock may set anew.
+
+    Parameters
+    ----------
+    since_ns : int
+        Time on the scale of the arrivals after which it holds.
+    offset_ns : int
+        UNIX time less time of arrival. It is 0 until the clock is first set while the process runs.
+    slept_ns : int
+        Total time for which the host was suspended; the times of arrival include it.
+    """
+
+    since_ns: int = 0
+    offset_ns: int = 0
+    slept_ns: int = 0
 
 
 class Arrival(NamedTuple):
@@ -122,7 +143,10 @@ class Arrival(NamedTuple):
         Time of the read, host clock (`imudrv.hostclock`); in a replay the recorded time.
     data : bytes or ndarray of MESSAGE
         Wire bytes, or CAN messages each with its own `t_ns`; empty when the wait ended without any.
+    timebase : Timebase
+        Relation of the times to UNIX time at the read.
     """
 
     t_ns: int
     data: bytes | Records
+    timebase: Timebase = Timebase()
