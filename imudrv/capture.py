@@ -141,6 +141,7 @@ class Capture:
             one does. Or a log has several channels and none was chosen, or not the chosen one.
         """
         self.tracker = SequenceTracker(self.layout)
+        self._clock = ClockModel(self.layout.interval_ns, self.profile.transmission_ns)
         for frames in self._frames(advance):
             yield self.tracker.feed(frames)
         if self.tracker.counts.frames == 0:
@@ -175,11 +176,10 @@ class Capture:
                 yield _unlocked(compensator.feed(pulses))
             yield _unlocked(compensator.close())
             return
-        clock = ClockModel(self.layout.interval_ns, self.profile.transmission_ns)
         for pulses in self.pulses(advance):
-            clock.feed(pulses)
-            yield clock.stamp(compensator.feed(pulses))
-        yield clock.stamp(compensator.close())
+            self._clock.feed(pulses)
+            yield self._clock.stamp(compensator.feed(pulses))
+        yield self._clock.stamp(compensator.close())
 
     def _frames(self, advance: Advance) -> Iterator[Records]:
         if self.recording is None:
@@ -194,6 +194,8 @@ class Capture:
             self._decoder = reads = FrameDecoder(self.layout)
             arrivals = self.recording.arrivals()
             while some := list(islice(arrivals, READS_AT_ONCE)):
+                for arrival in some:
+                    self._clock.follow(arrival.timebase)
                 # Each read has its own time; the later stages cost by the call.
                 yield np.concatenate([reads.feed(arrival.data, arrival.t_ns) for arrival in some])
                 advance(sum(len(arrival.data) for arrival in some))

@@ -326,7 +326,8 @@ def _least(e: np.void, points: NDArray[np.int64], x: int) -> float:
     """Return the least y to expect: that of the line; before there is one, of the first bin less the skew."""
     if e["fitted"]:
         return height(line_of(e), x)
-    return points[1, e["first"]] - MAX_SKEW * (x - points[0, e["first"]])
+    first = e["first"]
+    return float(points[1, first] - MAX_SKEW * (x - points[0, first]))
 
 
 @kernel
