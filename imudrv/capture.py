@@ -2,7 +2,8 @@
 
 import os
 from collections.abc import Callable, Iterator
-from itertools import islice
+from itertools import groupby, islice
+from operator import attrgetter
 from pathlib import Path
 from typing import TypeAlias
 
@@ -192,13 +193,12 @@ class Capture:
                     advance(len(data))
         else:
             self._decoder = reads = FrameDecoder(self.layout)
-            arrivals = self.recording.arrivals()
-            while some := list(islice(arrivals, READS_AT_ONCE)):
-                for arrival in some:
-                    self._clock.follow(arrival.timebase)
-                # Each read has its own time; the later stages cost by the call.
-                yield np.concatenate([reads.feed(arrival.data, arrival.t_ns) for arrival in some])
-                advance(sum(len(arrival.data) for arrival in some))
+            for timebase, arrivals in groupby(self.recording.arrivals(), attrgetter("timebase")):
+                self._clock.follow(timebase)
+                while some := list(islice(arrivals, READS_AT_ONCE)):
+                    # Each read has its own time; the later stages cost by the call.
+                    yield np.concatenate([reads.feed(arrival.data, arrival.t_ns) for arrival in some])
+                    advance(sum(len(arrival.data) for arrival in some))
         frames = self._decoder.close()
         self._check_channel()
         yield frames

@@ -121,15 +121,12 @@ class Timebase(NamedTuple):
 
     Parameters
     ----------
-    since_ns : int
-        Time on the scale of the arrivals after which it holds.
     offset_ns : int
         UNIX time less time of arrival. It is 0 until the clock is first set while the process runs.
     slept_ns : int
         Total time for which the host was suspended; the times of arrival include it.
     """
 
-    since_ns: int = 0
     offset_ns: int = 0
     slept_ns: int = 0
 

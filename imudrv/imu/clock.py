@@ -17,7 +17,6 @@ Where a timer delivers samples in bursts, the newest of a burst shows the clock.
 samples more slowly than once in the window hides up to one interval, which the arrivals cannot show.
 """
 
-from collections import deque
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -147,21 +146,25 @@ class ClockModel:
         self._points = room_for_points(window_ns)
         self._stamps = np.empty(_ROOM, STAMP)
         self._taken = self._fed = 0
-        self._newest = Timebase()
-        self._coming: deque[Timebase] = deque()
-        self._slept_ns = 0
+        self._timebase = Timebase()
 
     def follow(self, timebase: Timebase) -> None:
-        """Use a timebase for samples that arrive after its `since_ns`; one that is in use changes nothing.
+        """Use a timebase for the samples that are fed from now on; the one in use changes nothing.
 
         Parameters
         ----------
         timebase : Timebase
-            That of an arrival, before its samples are fed.
+            That of the next arrival.
         """
-        if timebase != self._newest:
-            self._newest = timebase
-            self._coming.append(timebase)
+        if timebase == self._timebase:
+            return
+        s = self._state[0]
+        if s["started"]:
+            s["stepped"] = True
+            s["woken"] |= timebase.slept_ns != self._timebase.slept_ns
+            s["steps"] += 1
+        s["offset_ns"] = timebase.offset_ns
+        self._timebase = timebase
 
     def feed(self, pulses: Records) -> Records:
         """Stamp samples.
@@ -179,16 +182,7 @@ class ClockModel:
         if self._fed + len(pulses) > len(self._stamps):
             self._make_room(len(pulses))
         stamps = self._stamps[self._fed : self._fed + len(pulses)]
-        fed = 0
-        while self._coming:
-            is_later = pulses["arrival_ns"][fed:] > self._coming[0].since_ns
-            if not is_later.any():
-                break
-            until = fed + int(is_later.argmax())
-            self._feed(pulses[fed:until], stamps[fed:until])
-            self._change(self._coming.popleft())
-            fed = until
-        self._feed(pulses[fed:], stamps[fed:])
+        _feed(pulses, stamps, self._constants, self._state, self._points)
         self._fed += len(pulses)
         return stamps
 
@@ -231,18 +225,6 @@ class ClockModel:
             worst_s=float(s["worst_ns"] * NS),
             steps=int(s["steps"]),
         )
-
-    def _feed(self, pulses: Records, stamps: Records) -> None:
-        _feed(pulses, stamps, self._constants, self._state, self._points)
-
-    def _change(self, timebase: Timebase) -> None:
-        """Change the timebase between two samples."""
-        s = self._state[0]
-        if s["started"]:
-            s["stepped"] = True
-            s["woken"] |= timebase.slept_ns != self._slept_ns
-            s["steps"] += 1
-        s["offset_ns"], self._slept_ns = timebase.offset_ns, timebase.slept_ns
 
     def _make_room(self, count: int) -> None:
         """Move queued stamps to a new array, with room for `count` more; returned stamps keep the old one."""

@@ -21,7 +21,7 @@ _FIRST_READINGS: Final = 5
 
 
 class ClockWatch:
-    """Comparison of the host's clocks, to be made after each read of the port.
+    """Comparison of the host's clocks, made after each read of the port.
 
     Parameters
     ----------
@@ -39,25 +39,19 @@ class ClockWatch:
         self.timebase = Timebase()
         first = min((read() for _ in range(_FIRST_READINGS)), key=lambda readings: readings.spread_ns)
         self._slept_origin_ns = first.now_ns - first.awake_ns
-        self._checked_ns = first.now_ns
 
     def poll(self) -> str:
-        """Compare the clocks; return what has happened to them since the last call, empty if nothing.
-
-        A new `timebase` holds from the last comparison on, so it includes the read before this call.
-        """
+        """Compare the clocks; return what has happened to them since the last call, empty if nothing."""
         readings = self._read()
         if readings.spread_ns > _MAX_SPREAD_NS:
             return ""
         offset_ns = readings.real_ns - readings.now_ns
         slept_ns = readings.now_ns - readings.awake_ns - self._slept_origin_ns
-        since_ns, self._checked_ns = self._checked_ns, readings.now_ns
         stepped_ns, suspended_ns = offset_ns - self.timebase.offset_ns, slept_ns - self.timebase.slept_ns
         has_stepped, has_slept = abs(stepped_ns) >= STEP_NS, suspended_ns >= STEP_NS
         if not has_stepped and not has_slept:
             return ""
         self.timebase = Timebase(
-            since_ns,
             offset_ns if has_stepped else self.timebase.offset_ns,
             slept_ns if has_slept else self.timebase.slept_ns,
         )
