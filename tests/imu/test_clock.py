@@ -233,6 +233,27 @@ def test_a_host_clock_that_steps_forward_is_followed_after_ten_seconds() -> None
     assert locked[50_250:].all()
 
 
+@pytest.mark.parametrize(
+    ("slew", "seconds", "worst_ms"),
+    [
+        (0.083, 12, 872),  # a host that becomes fast looks like a stall, until all samples of 10 s were late
+        (-0.083, 12, 6),  # one that becomes slow is noticed when arrivals are 5 ms early
+        (500e-6, 200, 25),  # 20 ms late are allowed, in the worst bin of 10 s
+    ],
+)
+def test_stamps_are_right_within_ten_seconds_after_ntp_has_slewed_the_host(
+    slew: float, seconds: int, worst_ms: int
+) -> None:
+    begin, end = 60_000, 60_000 + 1000 * seconds
+    true = truth(samples(end + 40_000), 20.0)
+    true += np.rint(slew * TAU * np.clip(np.arange(len(true)) - begin, 0, end - begin)).astype(np.int64)
+    stamps, locked = stamped(ClockModel(TAU), heard(true, np.random.default_rng(9)))
+    assert np.abs(stamps - true)[LOCK:].max() < worst_ms * MS
+    assert np.abs(stamps - true)[end + LOCK :].max() < 0.25 * MS  # 20 ppm of 10 s without a line
+    assert locked[end + 2 * LOCK :].all()
+    assert np.abs(stamps - true)[end + 2 * LOCK + 1000 :].max() < 0.05 * MS
+
+
 def test_a_restart_of_the_unit_begins_the_line_anew() -> None:
     before, after = samples(20_000, first=500_000), samples(20_000)
     after["elapsed_ns"] += before["elapsed_ns"][-1]  # as the tracker counts on
