@@ -2,7 +2,8 @@
 
 import os
 from collections.abc import Callable, Iterator
-from itertools import islice
+from itertools import groupby, islice
+from operator import attrgetter
 from pathlib import Path
 from typing import TypeAlias
 
@@ -153,6 +154,7 @@ class Capture:
             one does. Or a log has several channels and none was chosen, or not the chosen one.
         """
         self._begin()
+        self._clock = ClockModel(self.layout.interval_ns, self.profile.transmission_ns)
         for frames in self._frames(advance):
             if not len(self._counters):
                 self._counters = frames["counter"].copy()
@@ -191,11 +193,10 @@ class Capture:
                 yield _unlocked(compensator.feed(pulses))
             yield _unlocked(compensator.close())
             return
-        clock = ClockModel(self.layout.interval_ns, self.profile.transmission_ns)
         for pulses in self.pulses(advance):
-            clock.feed(pulses)
-            yield clock.stamp(compensator.feed(pulses))
-        yield clock.stamp(compensator.close())
+            self._clock.feed(pulses)
+            yield self._clock.stamp(compensator.feed(pulses))
+        yield self._clock.stamp(compensator.close())
 
     def _frames(self, advance: Advance) -> Iterator[Records]:
         if self.recording is None:
@@ -208,11 +209,12 @@ class Capture:
                     advance(len(data))
         else:
             self._decoder = reads = FrameDecoder(self.layout)
-            arrivals = self.recording.arrivals()
-            while some := list(islice(arrivals, READS_AT_ONCE)):
-                # Each read has its own time; the later stages cost by the call.
-                yield np.concatenate([reads.feed(arrival.data, arrival.t_ns) for arrival in some])
-                advance(sum(len(arrival.data) for arrival in some))
+            for timebase, arrivals in groupby(self.recording.arrivals(), attrgetter("timebase")):
+                self._clock.follow(timebase)
+                while some := list(islice(arrivals, READS_AT_ONCE)):
+                    # Each read has its own time; the later stages cost by the call.
+                    yield np.concatenate([reads.feed(arrival.data, arrival.t_ns) for arrival in some])
+                    advance(sum(len(arrival.data) for arrival in some))
         frames = self._decoder.close()
         self._check_channel()
         yield frames

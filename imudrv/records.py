@@ -138,6 +138,21 @@ class Source(IntEnum):
     SIMULATOR = 2
 
 
+class Timebase(NamedTuple):
+    """From times of arrival, which never step, to UNIX time, which the host's clock may set anew.
+
+    Parameters
+    ----------
+    offset_ns : int
+        UNIX time less time of arrival. It is 0 until the clock is first set while the process runs.
+    slept_ns : int
+        Total time for which the host was suspended; the times of arrival include it.
+    """
+
+    offset_ns: int = 0
+    slept_ns: int = 0
+
+
 class Arrival(NamedTuple):
     """Data of one read of a port.
 
@@ -147,10 +162,13 @@ class Arrival(NamedTuple):
         Time of the read, host clock (`imudrv.hostclock`); in a replay the recorded time.
     data : bytes or ndarray of MESSAGE
         Wire bytes, or CAN messages each with its own `t_ns`; empty when the wait ended without any.
+    timebase : Timebase
+        Relation of the times to UNIX time at the read.
     """
 
     t_ns: int
     data: bytes | Records
+    timebase: Timebase = Timebase()
 
     @property
     def size(self) -> int:

@@ -24,6 +24,7 @@ import pytest
 from numpy.typing import ArrayLike, NDArray
 from realtime import DEADLINE_S, free_port, until
 
+from imudrv import compensate
 from imudrv.calibration import write_calibration
 from imudrv.errors import InputError
 from imudrv.profiles import load
@@ -719,3 +720,55 @@ def test_a_replay_of_a_capture_gives_what_the_offline_command_gives(folder: Path
     # All but source, flags and time, which a replay has and a capture has not, and the check over them.
     for part in (slice(8, 16), slice(24, 72)):
         np.testing.assert_array_equal(live[:, part], offline[:, part])
+
+
+SET_BY_A_FILE = """\
+import time
+
+real_ns = time.time_ns
+
+def set_by_a_file():
+    with open({path!r}) as file:
+        return real_ns() + int(file.read())
+
+time.time_ns = set_by_a_file
+"""
+
+
+def test_a_clock_that_is_set_by_an_hour_is_logged_flagged_and_followed(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    step = folder / "step"
+    step.write_text("0")
+    (folder / "sitecustomize.py").write_text(SET_BY_A_FILE.format(path=str(step)))
+    monkeypatch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)
+    unit = Unit(folder / "unit")
+    out = f"udp://127.0.0.1:{free_port()}"
+    with (
+        receive(out, timeout_s=DEADLINE_S) as receiver,
+        serving(folder, *serial(folder), "--out", out, "--record", "run.mcap") as service,
+    ):
+        with repeating(lambda: unit.send(20)):
+            until(lambda: service.good() > 200, "samples")
+            (folder / "next").write_text(str(3600 * 10**9))
+            (folder / "next").rename(step)
+            until(lambda: service.logged("the host's clock was set by +3600.000 s"), "the event")
+            good = service.good()
+            until(lambda: service.good() > good + 200, "more samples")
+            status = service.status()
+        assert service.stop() == 0
+        assert status["clock"]["steps"] == 1
+        assert any("set by +3600.000 s" in event for event in status["events"])
+        live = np.concatenate([next(receiver) for _ in range(10)])
+        while live["counter"][-1] < good + 200:
+            live = np.concatenate([live, next(receiver)])
+    (first,) = np.flatnonzero(live["flags"] & Flag.CLOCK_STEPPED)
+    assert (live["interval_ns"] == 1_000_000).all()
+    advance = np.diff(live["t_ns"])
+    assert np.delete(advance, first - 1).min() > 0
+    assert np.argmax(advance) == first - 1
+    # This run takes a minute at most, an hour is 60 of them.
+    assert 3540 * 10**9 < advance[first - 1] < 3660 * 10**9
+    assert status["last"]["t_ns"] > live["t_ns"][0] + 3540 * 10**9
+    offline = compensate(folder / "run.mcap")
+    np.testing.assert_array_equal(offline[: len(live)], live)

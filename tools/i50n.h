@@ -41,7 +41,10 @@ enum i50n_flag {
     I50N_TEMPERATURE_RANGE = 1 << 5, /* outside of the calibrated range */
     I50N_SIZE_EFFECT = 1 << 6,       /* compensated */
     I50N_CLOCK_UNLOCKED = 1 << 7,    /* t_ns is not reliable yet */
-    I50N_WARM_UP = 1 << 8
+    I50N_WARM_UP = 1 << 8,
+    I50N_GAP_BY_HOST_TIME = 1 << 9,    /* the gap before this sample is known from host time only */
+    I50N_GAP_LENGTH_UNKNOWN = 1 << 10, /* more samples may be missing than the counter shows */
+    I50N_CLOCK_STEPPED = 1 << 11       /* the host's clock was set, or the host slept: t_ns may jump, also back */
 };
 
 enum i50n_result { I50N_OK = 0, I50N_TOO_SHORT, I50N_BAD_MAGIC, I50N_BAD_VERSION, I50N_BAD_CRC };

@@ -211,7 +211,7 @@ def _listen(port: Port, transport: str, seconds: float) -> tuple[bytes | Records
             port.read(_DISCARD_S)  # what the system has buffered says nothing about the rate
         begin_s = time.monotonic()
         while (left := begin_s + seconds - time.monotonic()) > 0 and amount < _MAX_AMOUNT:
-            t_ns, data = port.read(left)
+            t_ns, data, _ = port.read(left)
             if len(data):
                 first_ns = first_ns or t_ns
                 last_ns = t_ns

@@ -5,6 +5,7 @@ the lowest latency; other devices are read by pyserial.
 """
 
 import errno
+import fcntl
 import os
 import select
 import socket
@@ -150,10 +151,10 @@ class DescriptorPort(Port):
 
     def line_errors(self) -> LineErrors:
         """See `Port.line_errors`."""
-        if sys.platform != "linux" or self._closed:
+        if self._closed:
             return LineErrors()
         try:
-            counts = fcntl.ioctl(self._ready[0], _TIOCGICOUNT, bytes(_COUNTS.size))
+            counts = fcntl.ioctl(self._fd, _TIOCGICOUNT, bytes(_COUNTS.size))
         except OSError:  # a pty, a socket, or a driver that does not count
             return LineErrors()
         framing, overrun, parity, _, buffer_overrun = _COUNTS.unpack(counts)[6:11]

@@ -5,6 +5,7 @@ channel                a message
 =====================  ==========================================================================
 ``/imu50/wire``        one read of the port at its host time: ``bytes`` as received, or
                        ``can-messages`` (see `pack_messages`)
+``/imu50/clock``       ``json``: the `Timebase` of the reads that follow; the default one until the first
 ``/imu50/increments``  ``i50n``: datagrams back to back
 ``/imu50/status``      ``json``: status of the service
 ``/imu50/events``      ``json``: ``{"text": ...}``, an event of the service
@@ -12,6 +13,9 @@ channel                a message
 
 The attachments ``profile.yaml`` and ``calibration.yaml`` make a recording self-contained; a calibration that
 was exchanged later is attached again at its time. The metadata record ``imu50`` is the recording's origin.
+
+The times of all messages are on the scale of the arrivals, which does not step; those within datagrams are
+UNIX time.
 """
 
 from collections.abc import Sequence
@@ -23,6 +27,7 @@ from imudrv.records import MESSAGE, Records
 
 WIRE: Final = "/imu50/wire"
 INCREMENTS: Final = "/imu50/increments"
+CLOCK: Final = "/imu50/clock"
 STATUS: Final = "/imu50/status"
 EVENTS: Final = "/imu50/events"
 

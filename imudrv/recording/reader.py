@@ -23,6 +23,7 @@ from imudrv.profiles.schema import Profile
 from imudrv.recording.format import (
     CALIBRATION,
     CAN_MESSAGES,
+    CLOCK,
     EVENTS,
     INCREMENTS,
     ORIGIN,
@@ -31,11 +32,13 @@ from imudrv.recording.format import (
     WIRE,
     unpack_messages,
 )
-from imudrv.records import Arrival, Records
+from imudrv.records import Arrival, Records, Timebase
 from imudrv.wire.datagram import DatagramDecoder
 
 MAX_RECORD_BYTES: Final = 64 << 20
 """Largest record, and largest unpacked chunk, bytes."""
+MAX_TIME_NS: Final = 2**62
+"""Largest time, and largest offset, of a timebase: 146 years."""
 
 _RECORD: Final = struct.Struct("<BQ")
 _MESSAGE: Final = struct.Struct("<HIQQ")
@@ -145,15 +148,19 @@ class Recording:
 
     def arrivals(self) -> Iterator[Arrival]:
         """Yield the reads of the port."""
-        for offset, channel, message in self._messages(WIRE):
+        timebase = Timebase()
+        for offset, channel, message in self._messages(WIRE, CLOCK):
+            if channel.topic == CLOCK:
+                timebase = self._timebase(offset, message.data)
+                continue
             if channel.message_encoding != CAN_MESSAGES:
-                yield Arrival(message.log_time, message.data)
+                yield Arrival(message.log_time, message.data, timebase)
                 continue
             try:
                 messages = unpack_messages(message.data)
             except ValueError as error:
                 raise self._corrupt(offset, str(error)) from error
-            yield Arrival(message.log_time, messages)
+            yield Arrival(message.log_time, messages, timebase)
 
     def increments(self) -> Iterator[Records]:
         """Yield the published increments, ndarrays of INCREMENTS; counters modulo 2^32."""
@@ -174,13 +181,26 @@ class Recording:
 
     def _documents(self, topic: str) -> Iterator[tuple[int, dict[str, Any]]]:
         for offset, _, message in self._messages(topic):
-            try:
-                document = json.loads(message.data)
-            except (ValueError, RecursionError) as error:
-                raise self._corrupt(offset, f"expected JSON: {error}") from error
-            if not isinstance(document, dict):
-                raise self._corrupt(offset, "expected a JSON object")
-            yield message.log_time, document
+            yield message.log_time, self._document(offset, message.data)
+
+    def _document(self, offset: int, data: bytes) -> dict[str, Any]:
+        try:
+            document = json.loads(data)
+        except (ValueError, RecursionError) as error:
+            raise self._corrupt(offset, f"expected JSON: {error}") from error
+        if not isinstance(document, dict):
+            raise self._corrupt(offset, "expected a JSON object")
+        return document
+
+    def _timebase(self, offset: int, data: bytes) -> Timebase:
+        document = self._document(offset, data)
+        values = map(document.get, Timebase._fields)
+        times = [value for value in values if type(value) is int and abs(value) <= MAX_TIME_NS]
+        if len(times) != len(Timebase._fields):
+            raise self._corrupt(
+                offset, f"expected {', '.join(Timebase._fields)}, each up to {MAX_TIME_NS} ns"
+            )
+        return Timebase(*times)
 
     def _attachments(self, name: str) -> Iterator[tuple[int, str]]:
         for offset, record in self.records(skip_messages=True):
@@ -190,14 +210,14 @@ class Recording:
                 except UnicodeDecodeError as error:
                     raise self._corrupt(offset, "expected text") from error
 
-    def _messages(self, topic: str) -> Iterator[tuple[int, Channel, Message]]:
+    def _messages(self, *topics: str) -> Iterator[tuple[int, Channel, Message]]:
         channels: dict[int, Channel] = {}
         for offset, record in self.records():
             if isinstance(record, Channel):
                 channels[record.id] = record
             elif isinstance(record, Message):
                 channel = channels[record.channel_id]
-                if channel.topic == topic:
+                if channel.topic in topics:
                     yield offset, channel, record
 
     def records(self, skip_messages: bool = False) -> Iterator[RecordAt]:

@@ -26,6 +26,7 @@ from imudrv.pipeline import Pipeline, PipelineOutput
 from imudrv.ports import PortEndedError
 from imudrv.records import INCREMENTS, PULSES, Arrival, Flag, Source
 from imudrv.service.calibration_watch import CalibrationWatch
+from imudrv.service.clock_watch import ClockWatch
 from imudrv.service.events import EventLog
 from imudrv.service.latency import Latency
 from imudrv.service.port import PortSupervisor
@@ -76,7 +77,9 @@ class Service:
     notices : callable, optional
         Returns further warnings for the status, a sentence each.
     clock : callable, optional
-        Returns the host time, ns.
+        Returns the time on the scale of the arrivals, ns.
+    clock_watch : ClockWatch, optional
+        Watch of the host's real-time clock.
 
     Raises
     ------
@@ -96,8 +99,10 @@ class Service:
         signals: SignalFlags | None = None,
         notices: Callable[[], list[str]] = list,
         clock: Callable[[], int] = now_ns,
+        clock_watch: ClockWatch | None = None,
     ) -> None:
         self._settings, self._clock = settings, clock
+        self._clock_watch = clock_watch or ClockWatch()
         self._version = version("imu50")  # reads files: not in the loop
         self._profile_file = profiles.load_file(settings.profile)
         self._profile = self._profile_file.model
@@ -171,7 +176,12 @@ class Service:
             arrival = self._port.read(POLL_NS * NS)
         except PortEndedError:
             return False
+        if step := self._clock_watch.poll():
+            self._events.offset_ns = self._clock_watch.timebase.offset_ns
+            self._events.event(step)
         if arrival is not None:
+            if self._port.source is not Source.REPLAY:
+                arrival = Arrival(arrival.t_ns, arrival.data, self._clock_watch.timebase)
             self._process(arrival)
         now = self._clock()
         if now >= self._next_poll_ns:
@@ -224,6 +234,7 @@ class Service:
 
     def _process(self, arrival: Arrival) -> None:
         self._recordings.arrived(arrival)
+        self._pipeline.clock.follow(arrival.timebase)
         output = self._pipeline.feed(arrival.data, arrival.t_ns)
         self._publish(output, arrival.t_ns)
         self._port.decoded(arrival, len(output.pulses))
@@ -288,7 +299,7 @@ class Service:
         return Status(
             software=self._version,
             pid=os.getpid(),
-            t_ns=now,
+            t_ns=now + self._clock_watch.timebase.offset_ns,
             uptime_s=(now - self._started_ns) * NS,
             port=self._port.status,
             profile=self._profile.name,

@@ -24,7 +24,7 @@ from imudrv.files.spool import AppendThread, Piece
 from imudrv.hostclock import now_ns
 from imudrv.recording import format
 from imudrv.recording.format import pack_messages
-from imudrv.records import Arrival, Source
+from imudrv.records import Arrival, Source, Timebase
 from imudrv.sinks.base import Batch, SinkState
 from imudrv.sinks.history import Moment
 from imudrv.wire.datagram import SIZE
@@ -91,7 +91,8 @@ class Recorder:
         self._calibrations: deque[tuple[int, bytes]] = deque(maxlen=10)
         self._put = 0
         self._reported = 0
-        self._sequences = [0] * 5
+        self._sequences = [0] * 6
+        self._timebase = Timebase()  # of the read written last
         self._staging = _Staging()
         self._writer = Writer(self._staging, use_chunking=False, use_statistics=False)
         self._begin(profile, calibration, source, port, unit)
@@ -192,12 +193,14 @@ class Recorder:
         writer.start(library=f"imu50 {version('imu50')}")
         status = writer.register_schema("imu50.Status", SchemaEncoding.JSONSchema, _STATUS_SCHEMA)
         event = writer.register_schema("imu50.Event", SchemaEncoding.JSONSchema, _EVENT_SCHEMA)
+        clock = writer.register_schema("imu50.Timebase", SchemaEncoding.JSONSchema, _TIMEBASE_SCHEMA)
         wire = format.CAN_MESSAGES if self._can else format.BYTES
-        # the library numbers channels in this order: _WIRE, _INCREMENTS, _STATUS, _EVENTS
+        # the library numbers channels in this order: _WIRE, _INCREMENTS, _STATUS, _EVENTS, _CLOCK
         writer.register_channel(format.WIRE, wire, 0)
         writer.register_channel(format.INCREMENTS, format.DATAGRAMS, 0)
         writer.register_channel(format.STATUS, MessageEncoding.JSON, status)
         writer.register_channel(format.EVENTS, MessageEncoding.JSON, event)
+        writer.register_channel(format.CLOCK, MessageEncoding.JSON, clock)
         origin = {
             "version": version("imu50"),
             "unit": unit,
@@ -222,6 +225,9 @@ class Recorder:
         data = [arrival.data for arrival in arrivals]
         pieces = pack_messages(data) if self._can and data else data  # type: ignore[arg-type]
         for arrival, piece in zip(arrivals, pieces, strict=True):
+            if arrival.timebase != self._timebase:
+                self._timebase = arrival.timebase
+                self._message(_CLOCK, arrival.t_ns, json.dumps(self._timebase._asdict()).encode())
             self._message(_WIRE, arrival.t_ns, piece)  # type: ignore[arg-type]
         batches = self._datagrams.take(_PIECE)
         datagrams = b"".join(batches)
@@ -245,8 +251,11 @@ class Recorder:
         self._staging.write(head + data)
 
 
-_WIRE, _INCREMENTS, _STATUS, _EVENTS = range(1, 5)
+_WIRE, _INCREMENTS, _STATUS, _EVENTS, _CLOCK = range(1, 6)
 _STATUS_SCHEMA: Final = json.dumps({"type": "object"}).encode()
+_TIMEBASE_SCHEMA: Final = json.dumps(
+    {"type": "object", "properties": {name: {"type": "integer"} for name in Timebase._fields}}
+).encode()
 _EVENT_SCHEMA: Final = json.dumps({"type": "object", "properties": {"text": {"type": "string"}}}).encode()
 
 

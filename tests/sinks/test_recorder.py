@@ -65,6 +65,7 @@ def test_the_library_itself_reads_all_that_was_recorded(batch, tmp_path: Path) -
             "/imu50/increments",
             "/imu50/status",
             "/imu50/events",
+            "/imu50/clock",
         ]
         (origin,) = reader.iter_metadata()
         assert origin.metadata["unit"] == "50-0017"
