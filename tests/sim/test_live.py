@@ -164,6 +164,28 @@ def test_an_unplugged_pty_reappears_under_its_link(scenario: Make, player: Playe
     assert len(whole(silent, RS422)) > len(whole(run, RS422))
 
 
+def test_a_link_never_leads_to_a_closed_pty(
+    scenario: Make, player: Player, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    link, close = tmp_path / "imu", os.close
+    is_linked: list[bool] = []
+
+    def closing(fd: int) -> None:
+        if os.readlink(f"/proc/self/fd/{fd}").endswith("ptmx"):  # the unit's end
+            is_linked.append(link.is_symlink())
+        close(fd)
+
+    monkeypatch.setattr(pty.os, "close", closing)
+    run = scenario({"rest": {"duration_s": 0.2}}, faults={"unplugs": [{"at_s": 0.1, "duration_s": 0.05}]})
+    player.start(run, RS422, "pty", 10.0, link=link)
+    fd = os.open(link, os.O_RDONLY | os.O_NOCTTY)
+    read_to_the_end(fd)
+    player.result()
+    close(fd)
+    assert is_linked
+    assert not any(is_linked)
+
+
 def test_in_real_time_the_unit_continues_without_a_reader_and_reports_it(
     scenario: Make, player: Player
 ) -> None:

@@ -98,15 +98,15 @@ class SimulatedPty(FileLine):
         self.undelivered += left
 
     def close(self) -> None:
-        """Close the pty and remove the link."""
+        """Remove the link and close the pty, in this order: no reader finds a closed pty."""
         if self._fd < 0:
             return
-        os.close(self._fd)
-        self._fd = -1
         if self._link is not None and self._link.is_symlink():
             with suppress(OSError):
                 if os.readlink(self._link) == self._path:
                     self._link.unlink()
+        os.close(self._fd)
+        self._fd = -1
 
 
 def queued_bytes(fd: int) -> int:
