@@ -137,11 +137,11 @@ class CaptureFile:
                     raise
                 except Exception as error:  # a reader may raise anything
                     raise self._explained(error, source) from error
-                if not data:
-                    return
-                end = source.position
+                end = source.position if data else self.size  # a reader need not read to the end
                 yield Piece(data, end - begin)
                 begin = end
+                if not data:
+                    return
 
     def _open(self) -> Source:
         try:

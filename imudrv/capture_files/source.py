@@ -17,7 +17,7 @@ CHUNK_BYTES: Final = 1 << 19
 """Bytes read at once: few enough for the cache, many enough that Python's overhead does not matter."""
 LONGEST_LINE: Final = 1 << 16
 """Maximum length of a line, bytes."""
-_PACKED_BYTES: Final = 1 << 10
+_PACKED_BYTES: Final = 1 << 8
 """Bytes unpacked at once; at most 2^15 times as many come out of them."""
 
 DAMAGED: Final = (EOFError, gzip.BadGzipFile, zlib.error, zstandard.ZstdError)
