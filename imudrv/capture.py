@@ -11,7 +11,8 @@ import numpy as np
 
 from imudrv import profiles
 from imudrv.calibration import Calibration, coefficients, read_calibration
-from imudrv.diagnosis import best_profile, find_mismatch, sequence_fault
+from imudrv.capture_files import CaptureFile, DamageSigns
+from imudrv.diagnosis import find_mismatch, fitting_profiles, sequence_fault
 from imudrv.errors import InputError
 from imudrv.imu.clock import ClockModel
 from imudrv.imu.compensation import Compensator
@@ -23,8 +24,8 @@ from imudrv.records import Flag, Reason, Records
 from imudrv.wire.candump import CandumpDecoder
 from imudrv.wire.decoder import CaptureDecoder, FrameDecoder, RejectedRuns
 
-CHUNK_BYTES = 1 << 19
-"""Bytes read at once: few enough for the cache, many enough that Python's overhead does not matter."""
+MANY_ERROR_FRAMES = 0.01
+"""Ratio of error frames to messages above which a bus is faulty."""
 READS_AT_ONCE = 1000
 """Reads of a recording that are decoded at once."""
 
@@ -42,18 +43,22 @@ class Capture:
     Parameters
     ----------
     path : path-like
-        Wire bytes; for a CAN profile a candump log; a name that ends in ``.mcap`` is a recording.
+        Wire bytes, a CAN log or a recording, in any of the forms of `imudrv.capture_files`.
     profile : Profile or path-like, optional
         Wire format of the unit: a profile, the name of a shipped one, or the path of its file. A recording
-        contains it.
+        contains it. If absent, that of the shipped ones which fits the beginning of the file.
     channel : str, optional
-        Channel of a candump log to read; needed if the log has several.
+        Channel of a CAN log to read; needed if the log has several.
 
     Attributes
     ----------
     path : Path
     size : int
-        Size of the file, bytes.
+        Size of the file as it is stored, bytes.
+    file : CaptureFile
+        What the file is.
+    is_profile_found : bool
+        Whether the profile was found among the shipped ones.
     recording : Recording or None
         The recording, if the file is one.
     profile : Profile
@@ -67,8 +72,8 @@ class Capture:
     Raises
     ------
     InputError
-        There is no such file, it is empty, a profile is needed, or there is a channel and the file is no
-        candump log.
+        There is no such file, it is empty or is none of the known forms by its name or content, none or
+        several of the shipped profiles fit, or there is a channel and the file is no CAN log.
 
     Examples
     --------
@@ -83,29 +88,19 @@ class Capture:
         channel: str | None = None,
     ) -> None:
         self.path = path = Path(path)
-        try:
-            with path.open("rb") as file:
-                self._head = file.read(1 << 16)
-            self.size = path.stat().st_size
-        except OSError as error:
-            raise InputError(f"{path}: expected a capture file, cannot read it: {error.strerror}") from error
-        if not self._head:
-            raise InputError(f"{path}: expected a capture, got an empty file")
-        self.recording = Recording(path) if path.suffix == ".mcap" else None
+        self.file = CaptureFile(path)
+        self.size = self.file.size
+        self.recording = Recording(path) if self.file.is_recording else None
+        self._channel = channel
+        self.is_profile_found = profile is None and self.recording is None
         if profile is None:
-            if self.recording is None:
-                raise InputError(f"{path}: expected --profile; only a recording contains its profile")
-            profile = self.recording.profile
+            profile = self._found_profile() if self.recording is None else self.recording.profile
         self.profile = profile if isinstance(profile, Profile) else profiles.load(profile)
         self.layout = self.profile.layout()
-        if channel is not None and (self.recording is not None or not self.layout.can):
-            kind = "a recording" if self.recording is not None else f"a capture of {self.layout.name}"
-            raise InputError(
-                f"{path}: --channel {channel}: expected a candump log, got {kind}; leave --channel out"
-            )
+        self._check_transport()
         self._begin()
-        self._channel = channel
         self._decoder: CaptureDecoder | FrameDecoder = FrameDecoder(self.layout)
+        self._signs = DamageSigns()
 
     def __repr__(self) -> str:
         return f"<Capture {self.path}, {self.profile.name}, {self.tracker.counts.frames} samples read>"
@@ -127,8 +122,22 @@ class Capture:
 
     @property
     def channels(self) -> dict[str, int]:
-        """Number of messages of each channel of a candump log, first of the one that is read."""
+        """Number of messages of each channel of a CAN log, first of the one that is read."""
         return self._log.channels if self._log is not None else {}
+
+    @property
+    def hints(self) -> list[str]:
+        """What the losses look like and what to do, one sentence each; of what was read so far."""
+        counts, hints = self.tracker.counts, []
+        if counts.lost or not counts.frames:
+            hints += self._signs.hints
+        errors, messages = self.rejected.get(Reason.ERROR_FRAME), sum(self.channels.values())
+        if errors is not None and errors.runs > MANY_ERROR_FRAMES * messages:
+            hints.append(
+                f"{errors.runs} error frames beside {messages} messages: the bus is faulty; "
+                "check its wiring, termination and bit rate"
+            )
+        return hints
 
     @property
     def _log(self) -> CandumpDecoder | None:
@@ -163,8 +172,8 @@ class Capture:
             yield pulses
         if self.tracker.counts.frames == 0:
             raise InputError(
-                f"{self.path}: expected frames of {self.layout.name}, "
-                f"got none in {self.size} bytes: {self._mismatch()}"
+                f"{self.path}: expected frames of {self.layout.name}, got none in {self.size} bytes of "
+                f"{self.file.description}: {'; '.join([*self.hints, self._mismatch()])}"
             )
 
     def increments(self, compensator: Compensator, advance: Advance = _no_progress) -> Iterator[Records]:
@@ -201,12 +210,14 @@ class Capture:
     def _frames(self, advance: Advance) -> Iterator[Records]:
         if self.recording is None:
             self._decoder = decoder = CaptureDecoder(self.layout, self._channel)
-            with self.path.open("rb") as file:
-                while data := file.read(CHUNK_BYTES):
-                    frames = decoder.feed(data)
-                    self._check_channel()
-                    yield frames
-                    advance(len(data))
+            self._signs = DamageSigns()
+            for piece in self.file.pieces():
+                if not self.layout.can:
+                    self._signs.feed(piece.data)
+                frames = decoder.feed(piece.data)
+                self._check_channel()
+                yield frames
+                advance(piece.bytes_read)
         else:
             self._decoder = reads = FrameDecoder(self.layout)
             for timebase, arrivals in groupby(self.recording.arrivals(), attrgetter("timebase")):
@@ -225,13 +236,59 @@ class Capture:
 
     def _mismatch(self) -> str:
         """Say what the beginning of the file holds instead of frames, and which shipped profile fits it."""
-        log, _ = CandumpDecoder(self._channel).feed(self._head)
+        if self.recording is not None:
+            return "its profile is not that of the unit"
+        head = self.file.head()
+        data = CandumpDecoder(self._channel).feed(head)[0] if self.layout.can else head
+        return f"{find_mismatch(self.profile, data, ()).found}; {self._other_profile()}"
+
+    def _check_transport(self) -> None:
+        """Refuse a profile, or a channel, that does not fit what the file is."""
+        kind = self.file.kind
+        if self._channel is not None and (self.recording is not None or not self.layout.can):
+            came = "a recording" if self.recording is not None else f"a capture of {self.layout.name}"
+            raise InputError(
+                f"{self.path}: --channel {self._channel}: expected a CAN log, got {came}; leave --channel out"
+            )
+        if kind is not None and kind.transport and (kind.transport == "can") != self.layout.can:
+            expected = "a CAN log" if self.layout.can else "wire bytes"
+            raise InputError(
+                f"{self.path}: expected {expected} for {self.layout.name}, got {self.file.description}; "
+                f"{self._other_profile()}"
+            )
+
+    def _found_profile(self) -> Profile:
+        """Return the shipped profile that fits the beginning of the file."""
+        found = self._fitting_profiles()
+        if len(found) == 1:
+            return found[0]
+        if found:
+            names = " and ".join(profile.name for profile in found)
+            raise InputError(
+                f"{self.path}: its beginning fits {names} equally well; choose one with --profile"
+            )
+        raise InputError(
+            f"{self.path}: expected a capture of a shipped profile ({', '.join(profiles.shipped())}), got "
+            f"{self.file.description}, which none of them fits; choose the unit's with --profile"
+        )
+
+    def _other_profile(self) -> str:
+        """Return which profile to try instead."""
+        found = [profile for profile in self._fitting_profiles() if profile.name != self.layout.name]
+        if not found:
+            return "no shipped profile fits its beginning; check the line settings, or write a profile"
+        return f"its beginning has frames of {found[0].name}: try --profile {found[0].name}"
+
+    def _fitting_profiles(self) -> list[Profile]:
+        head, kind = self.file.head(), self.file.kind
         shipped = [profiles.load(name) for name in profiles.shipped()]
-        mismatch = find_mismatch(self.profile, log if self.layout.can else self._head, shipped)
-        fitting = mismatch.fitting or best_profile(shipped, self._head if self.layout.can else log)
-        if fitting is None:
-            return f"{mismatch.found}; is it the right file, and the right --profile?"
-        return f"{mismatch.found}; this looks like {fitting.name}: try --profile {fitting.name}"
+        found = [] if kind is not None and kind.transport == "can" else fitting_profiles(shipped, head)
+        if not found:
+            log = CandumpDecoder(self._channel)
+            messages, _ = log.feed(head)
+            log.check_channel(str(self.path), "--channel ")
+            found = fitting_profiles(shipped, messages)
+        return found
 
 
 def compensate(

@@ -71,7 +71,7 @@ def test_a_log_of_two_units_is_refused_by_every_command_however_late_the_second_
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("imudrv.capture.CHUNK_BYTES", 4096)  # the log is read in 70 pieces
+    monkeypatch.setattr("imudrv.capture_files.source.CHUNK_BYTES", 4096)  # the log is read in 70 pieces
     main, before, after = COMMANDS[command]
     assert main([*before, log, *after]) == 2
     assert capsys.readouterr().err == f"error: {BOTH.replace('two.log', log)}--channel can0\n"
@@ -143,7 +143,7 @@ def test_a_channel_of_what_is_no_can_log_is_refused(
         arguments = [profile if a == "imu50-can" else a for a in after]
         assert main([*before, name, *arguments, "--channel", "can0"]) == 2
         message = capsys.readouterr().err
-        expected = f"error: {name}: --channel can0: expected a candump log, got {what}; leave --channel out\n"
+        expected = f"error: {name}: --channel can0: expected a CAN log, got {what}; leave --channel out\n"
         assert message == expected
 
 

@@ -71,7 +71,12 @@ def find_mismatch(profile: Profile, data: bytes | Records, candidates: Iterable[
 
 
 def best_profile(candidates: Iterable[Profile], data: bytes | Records) -> Profile | None:
-    """Return the profile that decodes most of the data.
+    """Return the profile that decodes most of the data, or None; see `fitting_profiles`."""
+    return next(iter(fitting_profiles(candidates, data)), None)
+
+
+def fitting_profiles(candidates: Iterable[Profile], data: bytes | Records) -> list[Profile]:
+    """Return the profiles that decode most of the data with the fewest losses: one, or several equally good.
 
     Parameters
     ----------
@@ -82,14 +87,18 @@ def best_profile(candidates: Iterable[Profile], data: bytes | Records) -> Profil
 
     Returns
     -------
-    Profile or None
-        None if none fits.
+    list of Profile
+        In the order of the candidates; empty if none fits.
     """
     transport = "serial" if isinstance(data, bytes) else "can"
-    found: tuple[int, Profile] | None = None
+    best = (0, 0)
+    found: list[Profile] = []
     for profile in candidates:
         if profile.transport == transport and (traffic := decode_traffic(profile, data)).fits:
             decoded = traffic.counts.frames * sum(m.length for m in profile.messages if m.is_part)
-            if found is None or decoded > found[0]:
-                found = decoded, profile
-    return found[1] if found else None
+            score = decoded, -traffic.counts.lost - traffic.counts.duplicate
+            if score > best:
+                best, found = score, []
+            if score == best:
+                found.append(profile)
+    return found
