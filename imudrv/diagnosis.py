@@ -104,7 +104,7 @@ def decode_traffic(profile: Profile, data: bytes | Records) -> TrafficSummary:
         syncs = data.count(bytes.fromhex(profile.messages[0].sync or ""))
         messages = {}
     else:
-        messages = {m.can_id: int(np.count_nonzero(data["id"] == m.can_id)) for m in layout.messages}
+        messages = {m.can_id: int(np.count_nonzero(data["id"] & m.can_mask == m.can_id)) for m in layout.messages}
         syncs = sum(messages.values())
     return TrafficSummary(
         len(data),
