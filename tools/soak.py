@@ -451,7 +451,7 @@ RANDOM_FAULTS: Final = {
 }
 
 
-def faults(folder: Path, seconds: float, wires: Sequence[str] = tuple(profiles.shipped())) -> list[Check]:
+def faults(folder: Path, seconds: float, wires: Sequence[str] = profiles.OWN) -> list[Check]:
     """One scenario with every fault there is: the same counts, offline, live and from the recording."""
     of_unit = {
         "silences": [{"at_s": 0.3 * seconds, "duration_s": 0.1 * seconds}],

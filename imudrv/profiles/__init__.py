@@ -1,4 +1,4 @@
-"""Profiles: wire formats of units as data. Four come with the package; a user's own is read by its path.
+"""Profiles: wire formats of units as data. Some come with the package; a user's own is read by its path.
 
 schema  the profile file, checked completely, and its translation into the decoder's `Layout`
 """
@@ -8,10 +8,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import resources
 from pathlib import Path
+from typing import Final
 
 from imudrv.errors import InputError
 from imudrv.files.settings_file import SettingsFile, read_file
 from imudrv.profiles.schema import Profile
+
+OWN: Final = ("imu50-rs422", "imu50-rs422-acc", "imu50-can", "imu50-canfd")
+"""Shipped profiles of the 50-type unit; the others are of units of other makers."""
 
 
 def shipped() -> list[str]:
@@ -63,7 +67,7 @@ def _file(name_or_path: str | os.PathLike[str]) -> Iterator[Path]:
         return
     if not Path(name).exists():
         raise InputError(
-            f"profile {name!r}: expected one of {', '.join(shipped())}, "
+            f"profile {name!r}: expected {', '.join(OWN)}, another one that `imudrv profiles` lists, "
             "or the path of a profile file; there is no such file"
         )
     yield Path(name)
