@@ -1,7 +1,7 @@
 """Captures in the wire formats of 24 units of other makers, each against its truth, offline and live.
 
-The captures lie beside the project; their README says what each holds and what was done to it. What is expected
-here follows from that text, not from the profiles.
+The captures lie beside the project; their README says what each holds and what was done to it. What is
+expected here follows from that text, not from the profiles.
 """
 
 import os
@@ -221,7 +221,7 @@ def truth_of(data: Path, name: str) -> Records:
 def increments(
     truth: Records, letter: str, sensor: Sensor, is_float: bool, unit: Unit
 ) -> NDArray[np.float64]:
-    """Increments of all samples in rad or m/s; NaN for an axis that the unit lacks. Row 0 of totals is none."""
+    """Increments of all samples, rad or m/s; NaN for an axis that the unit lacks; totals begin with 0."""
     out = np.full((len(truth), 3), np.nan)
     for k, axis in enumerate("xyz"):
         if letter + axis not in (truth.dtype.names or ()):
@@ -434,7 +434,7 @@ def test_a_live_unit_gives_what_its_capture_gives(
     frames, samples, counts = live(name)
     assert counts.closes
     assert (counts.good, counts.duplicate, counts.restarts) == (len(offline), 0, 0)
-    # The test sends as fast as it can: where the host's clock numbers the samples, only what they hold counts.
+    # The test sends as fast as it can: where the host's clock numbers samples, only what they hold counts.
     by_arrival = (
         {"counter", "elapsed_ns", "interval_ns", "flags", "arrival_ns"} if name in BY_ARRIVAL else set()
     )

@@ -1,6 +1,7 @@
 """Profiles: wire formats of units as data. Some come with the package; a user's own is read by its path.
 
 schema  the profile file, checked completely, and its translation into the decoder's `Layout`
+dbc     skeleton of a profile from a DBC file
 """
 
 import os
