@@ -268,7 +268,7 @@ class Capture:
                 f"{self.path}: its beginning fits {names} equally well; choose one with --profile"
             )
         raise InputError(
-            f"{self.path}: expected a capture of a shipped profile ({', '.join(profiles.shipped())}), got "
+            f"{self.path}: expected a capture of a shipped profile (list them with `imudrv profiles`), got "
             f"{self.file.description}, which none of them fits; choose the unit's with --profile"
         )
 

@@ -93,7 +93,7 @@ def driven(
     return increments, true[first:]
 
 
-@pytest.mark.parametrize("profile", profiles.shipped())
+@pytest.mark.parametrize("profile", profiles.OWN)
 def test_increments_equal_the_truth_within_the_quantisation(profile: str) -> None:
     arcsec, pulse_per_m_s = 0.5, 2000.0
     calibration = unit(arcsec, pulse_per_m_s)

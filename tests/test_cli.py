@@ -137,7 +137,10 @@ def test_a_candump_log_works_for_the_can_profiles(bench: Path) -> None:
             ["decode", "nothing.raw", "--profile", "imu50-rs422", "-o", "o.npz"],
             "nothing.raw: expected a capture",
         ),
-        (["decode", "run.raw", "--profile", "imu51", "-o", "o.npz"], "expected one of imu50-can"),
+        (
+            ["decode", "run.raw", "--profile", "imu51", "-o", "o.npz"],
+            "another one that `imudrv profiles` lists",
+        ),
         (
             ["decode", "run.raw", "--profile", "imu50-rs422", "-o", "o.txt"],
             "expected a name ending in .csv, .npz",

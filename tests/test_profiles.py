@@ -115,8 +115,9 @@ def test_the_worked_frame_of_the_icd_decodes_to_its_numbers() -> None:
     assert frame["status"] == 1
 
 
-def test_all_four_profiles_ship_with_the_line_and_rate_of_the_icd() -> None:
-    lines = {name: profiles.load(name).line for name in profiles.shipped()}
+def test_the_profiles_of_the_icd_ship_with_its_line_and_rate() -> None:
+    assert set(profiles.OWN) <= set(profiles.shipped())
+    lines = {name: profiles.load(name).line for name in profiles.OWN}
     assert {name: line.model_dump(exclude_none=True) for name, line in lines.items()} == {
         "imu50-rs422": {"baudrate": 921600, "bytesize": 8, "parity": "none", "stopbits": 1},
         "imu50-rs422-acc": {"baudrate": 460800, "bytesize": 8, "parity": "none", "stopbits": 1},
@@ -185,6 +186,14 @@ def test_an_invalid_profile_is_refused_with_the_reason(
         profiles.load(written(tmp_path, stream_profile(**change)))
 
 
+@pytest.mark.parametrize("name", profiles.shipped())
+def test_a_shipped_profile_is_of_its_name_and_says_where_it_is_from(name: str) -> None:
+    assert profiles.load(name).name == name
+    comment = profiles.content(name).decode().partition("format:")[0]
+    assert comment.startswith("# ")
+    assert "ICD" in comment if name in profiles.OWN else "Not tried on hardware" in comment
+
+
 def test_an_unknown_profile_names_the_shipped_ones() -> None:
-    with pytest.raises(InputError, match="imu50-rs422-acc"):
+    with pytest.raises(InputError, match=r"imu50-rs422-acc.*imudrv profiles"):
         profiles.load("imu51")

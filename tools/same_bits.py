@@ -43,7 +43,7 @@ from imudrv.imu.sequence import SequenceTracker
 from imudrv.nav.alignment import Alignment
 from imudrv.nav.mechanisation import Navigator
 from imudrv.pipeline import Pipeline
-from imudrv.profiles import load, shipped
+from imudrv.profiles import OWN, load
 from imudrv.profiles.schema import Profile
 from imudrv.records import Records
 from imudrv.sim.capture import record, wire
@@ -121,7 +121,7 @@ def machine() -> str:
 
 def results() -> Results:
     """Yield name and hash of each result."""
-    for name in shipped():
+    for name in OWN:
         profile, run = load(name), scenario([ROCK], faults=FAULTS)
         for what, fingerprint in (*offline(profile, run), *live(profile, run)):
             yield f"{name}: {what}", fingerprint

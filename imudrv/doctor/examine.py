@@ -142,7 +142,7 @@ def examine(
 def _default_profile(parts: Url) -> Profile:
     """Return a profile whose line settings are tried first if the user names none."""
     transport = "can" if parts.scheme == "can" else "serial"
-    return next(p for p in map(profiles.load, profiles.shipped()) if p.transport == transport)
+    return next(p for p in map(profiles.load, profiles.OWN) if p.transport == transport)
 
 
 def _with_line_of(parts: Url, profile: Profile) -> Profile:

@@ -1,5 +1,6 @@
 """Settings files that come with the package, found by name; a user's own is found by its path."""
 
+import difflib
 import os
 from pathlib import Path
 
@@ -37,8 +38,10 @@ def find(kind: str, name_or_path: str | os.PathLike[str], folder: Path) -> Path:
     if name in known:
         return folder / f"{name}.yaml"
     if not Path(name).exists():
+        near = difflib.get_close_matches(name, known, 1)
+        hint = f"; did you mean {near[0]}?" if near else ""
         raise InputError(
             f"{kind} {name!r}: expected one of {', '.join(known)}, "
-            f"or the path of a {kind} file; there is no such file"
+            f"or the path of a {kind} file; there is no such file{hint}"
         )
     return Path(name)

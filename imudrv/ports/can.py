@@ -79,7 +79,11 @@ def prepare(url: Url, profile: Profile) -> "Callable[[], CanPort]":
     line = settings_file.parse({**profile.line.model_dump(), **asked}, CanLine, url.text)
     options |= _rates(url, interface, line, fd)
     filters = [
-        {"can_id": kind.can_id & _ID_MASK, "can_mask": _ID_MASK, "extended": bool(kind.can_id & EXTENDED)}
+        {
+            "can_id": kind.can_id & _ID_MASK,
+            "can_mask": kind.can_mask & _ID_MASK,
+            "extended": bool(kind.can_id & EXTENDED),
+        }
         for kind in profile.layout().messages
     ]
     return partial(_open, url.text, interface, channel, {**options, "can_filters": filters})

@@ -1,6 +1,7 @@
-"""Profiles: wire formats of units as data. Four come with the package; a user's own is read by its path.
+"""Profiles: wire formats of units as data. Some come with the package; a user's own is read by its path.
 
 schema  the profile file, checked completely, and its translation into the decoder's `Layout`
+dbc     skeleton of a profile from a DBC file
 """
 
 import os
@@ -11,6 +12,8 @@ from imudrv.files import shipped as shipped_files
 from imudrv.files.settings_file import SettingsFile, read_file
 from imudrv.profiles.schema import Profile
 
+OWN: Final = ("imu50-rs422", "imu50-rs422-acc", "imu50-can", "imu50-canfd")
+"""Shipped profiles of the 50-type unit; the others are of units of other makers."""
 _FOLDER: Final = Path(__file__).parent
 
 

@@ -21,6 +21,7 @@ LATE: Final = 64
 """A message at most this many samples before the newest is a duplicate; if older, the unit has restarted."""
 
 _MAX_LENGTH: Final = 64
+_EVER_NS: Final = 1 << 62
 _ROOM: Final = _MAX_LENGTH + SLACK
 
 CONSTANTS: Final = np.dtype(
@@ -196,7 +197,9 @@ def _constants(layout: Layout, kinds: Records) -> Records:
     constants["hold"] = np.max(2 * np.array(every) * has_full_counter) if low_bits else 0
     constants["late"] = LATE if low_bits >= NARROW_BITS else 0
     constants["is_ordered"] = layout.is_ordered or not low_bits
-    constants["longest_ns"] = layout.interval_ns // 2
+    # Half of the time until another sample could be meant.
+    period = 1 if constants["is_ordered"][0] else (1 << int(low_bits)) / layout.sequence.step
+    constants["longest_ns"] = min(int(period * layout.interval / 2), _EVER_NS)
     constants["inverted"] = layout.status.inverted
     return constants
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from realtime import DEADLINE_S, free_port
 
-from imudrv import Source
+from imudrv import Source, load_profile
 from imudrv.errors import InputError
 from imudrv.hostclock import now_ns
 from imudrv.ports import PortLostError, open_port
@@ -87,6 +87,18 @@ def test_an_identifier_of_29_bits_is_received_and_differs_from_one_of_11_bits(ca
         unit.send(_message(0x151))
     received = np.concatenate([arrival.data for arrival in arrivals(port, 2)])
     assert received["id"].tolist() == [EXTENDED | 0x1ABCDEF0, 0x151]
+
+
+def test_of_a_parameter_group_every_priority_and_source_comes(opened, arrivals):
+    port = opened("can://virtual/groups", load_profile("openimu-j1939"))
+    sent = [0x0CF02A80, 0x18F02D81, 0x0CF02B80, 0x0CF02D80]
+    with _bus("groups") as unit:
+        for identifier in sent:
+            unit.send(_message(identifier))
+    received = np.concatenate([arrival.data for arrival in arrivals(port, 3)])
+    assert received["id"].tolist() == [
+        EXTENDED | identifier for identifier in sent if identifier != 0x0CF02B80
+    ]
 
 
 def test_a_bus_that_filters_nothing_gives_both_kinds_of_identifier(arrivals):

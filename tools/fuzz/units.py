@@ -17,7 +17,7 @@ from imudrv.wire.layout import Layout
 
 from .random_input import pick
 
-TEXTS: Final = {name: (resources.files(profiles) / f"{name}.yaml").read_text() for name in profiles.shipped()}
+TEXTS: Final = {name: (resources.files(profiles) / f"{name}.yaml").read_text() for name in profiles.OWN}
 PLAIN: Final = {name: yaml.safe_load(text) for name, text in TEXTS.items()}
 SHIPPED: Final = {name: profiles.load(name).layout() for name in TEXTS}
 SERIAL: Final = tuple(name for name, layout in SHIPPED.items() if not layout.can)

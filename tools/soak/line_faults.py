@@ -20,9 +20,7 @@ RATES: Final = {
 }
 
 
-def line_faults(
-    folder: Path, seconds: float, names: Sequence[str] = tuple(profiles.shipped())
-) -> list[Check]:
+def line_faults(folder: Path, seconds: float, names: Sequence[str] = profiles.OWN) -> list[Check]:
     """Play the faults through each profile."""
     unit_faults = {
         "silences": [{"at_s": 0.3 * seconds, "duration_s": 0.1 * seconds}],
