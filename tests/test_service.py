@@ -378,15 +378,29 @@ def test_frames_whose_counter_stands_still_are_a_failure(folder: Path) -> None:
         assert service.stop() == 0
 
 
-def test_a_program_that_reads_the_port_too_is_named_while_nothing_is_decoded(folder: Path) -> None:
+@pytest.mark.parametrize("are_frames", [True, False])
+def test_a_program_that_has_the_port_open_is_named_until_it_ends(are_frames: bool, folder: Path) -> None:
     unit = Unit(folder / "unit")
-    with serving(folder, *serial(folder)) as service, (folder / "unit").open("rb") as port:
-        with subprocess.Popen(["sleep", "600"], stdin=port) as other:
+
+    def send() -> None:
+        if are_frames:
+            unit.send(20)
+            unit.skip(20)
+        else:
+            unit.write(bytes(range(1, 200)))
+
+    with serving(folder, *serial(folder)) as service, repeating(send):
+        with (folder / "unit").open("rb") as port, subprocess.Popen(["sleep", "600"], stdin=port) as other:
             try:
-                with repeating(lambda: unit.write(bytes(range(1, 200)))):
-                    until(lambda: service.logged(f"sleep (process {other.pid})"), "the other program")
+                name = f"sleep (process {other.pid})"
+                until(lambda: name in str(service.status()["port"]["users"]), "the other program")
+                assert service.logged("port also open in ")
+                answer = service.command("status")
+                assert answer.returncode in (3, 4)
+                assert name in answer.stdout
             finally:
                 other.kill()
+        until(lambda: name not in str(service.status()["port"]["users"]), "its end")
         assert service.stop() == 0
 
 

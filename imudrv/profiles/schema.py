@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from fractions import Fraction
-from functools import cached_property
 from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import Field as Key
@@ -221,7 +220,7 @@ class Profile(Model):
         """Sample rate, Hz."""
         return float(self.rate)
 
-    @cached_property
+    @property
     def rate(self) -> Fraction:
         """Sample rate, Hz, exactly."""
         if isinstance(self.sample_rate_hz, tuple):

@@ -291,7 +291,7 @@ class Service:
         self._rate_hz = (self._samples - self._rated_samples) / ((now - self._rated_ns) * NS)
         self._lost_last_s = counts.lost - self._rated_lost
         self._rated_samples, self._rated_lost, self._rated_ns = self._samples, counts.lost, now
-        self._port.check_rate(counts.expected, now)
+        self._port.check_rate(counts.expected, self._lost_last_s, now)
 
     def _assemble_status(self, now: int) -> Status:
         calibration, pipeline = self._calibration, self._pipeline

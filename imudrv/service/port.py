@@ -7,8 +7,10 @@ from typing import Final
 from imudrv.diagnosis import LineState, LineWatch
 from imudrv.ports import Port, PortEndedError, PortLostError, check_url, open_port
 from imudrv.ports.base import LineErrors
+from imudrv.ports.holders import holders
 from imudrv.profiles.schema import Profile
 from imudrv.records import Arrival, Source
+from imudrv.service.background import Background
 from imudrv.service.events import EventLog
 from imudrv.service.mismatch_search import MismatchSearch
 from imudrv.service.status import PortStatus
@@ -61,7 +63,10 @@ class PortSupervisor:
         self.state = LineState("connecting")
         self._port: Port | None = None
         self._watch = LineWatch(profile, self._in_real_time, clock())
-        self._search = MismatchSearch(profile, split(url).device)
+        self._search = MismatchSearch(profile)
+        self._device = split(url).device
+        self._user_search = Background[list[str]]()
+        self._users: list[str] = []
         self._errors = LineErrors()  # counted by the driver while the data was good
         self._reconnects = 0
         self._attempts, self._next_attempt_ns = 0, 0
@@ -69,7 +74,7 @@ class PortSupervisor:
     @property
     def status(self) -> PortStatus:
         """Current status of the port."""
-        return PortStatus(self._url, *self.state, self._reconnects, self.source.name.lower())
+        return PortStatus(self._url, *self.state, self._users, self._reconnects, self.source.name.lower())
 
     def read(self, timeout_s: float) -> Arrival | None:
         """Wait for data.
@@ -109,13 +114,35 @@ class PortSupervisor:
         """Take note of the number of samples that an arrival completed."""
         self._watch.arrived(arrival.data, samples, self._clock())
 
-    def check_rate(self, expected: int, now_ns: int) -> None:
-        """Check the rate; call it about once a second with the number of samples by the unit's counter."""
+    def check_rate(self, expected: int, lost: int, now_ns: int) -> None:
+        """Check the rate, and after losses which other programs have the port open; call it once a second.
+
+        Parameters
+        ----------
+        expected : int
+            Number of samples by the unit's counter.
+        lost : int
+            Number of samples lost since the last call.
+        now_ns : int
+            Present time.
+        """
         if self._port is None:
             return
         self._watch.counted(expected, now_ns)
         if self.state.name == "streaming":
             self._errors = self._port.line_errors()
+        if lost or self._users or self.state.name == "unreadable":
+            self._check_users(now_ns)
+
+    def _check_users(self, now_ns: int) -> None:
+        if self._device is None:
+            return
+        before, device = self._users, self._device
+        self._users = self._user_search.poll(now_ns, lambda: holders(device.resolve())[0]) or []
+        if self._users and not before:
+            self._events.failure(
+                f"port also open in {', '.join(self._users)}: each program receives only a part of the data"
+            )
 
     def check_line(self, now_ns: int) -> None:
         """Report a line that has become silent, unreadable or good again, or whose rate is wrong."""
@@ -124,7 +151,7 @@ class PortSupervisor:
         before, state = self.state, self._watch.state(now_ns)
         if state.name == "unreadable":
             errors = self._port.line_errors().since(self._errors)
-            reason = self._search.poll(now_ns, lambda: self._watch.undecoded, errors)
+            reason = self._search.poll(now_ns, self._watch.undecoded, errors)
             state = state._replace(trouble=f"{state.trouble}: {reason}")
         elif before.name == "unreadable":
             self._search.clear()
@@ -164,5 +191,7 @@ class PortSupervisor:
         self.state = LineState("streaming")
         self._watch = LineWatch(self._profile, self._in_real_time, self._clock())
         self._search.clear()
+        self._user_search.clear()
+        self._users = []
         self._errors = self._port.line_errors()
         return self._port

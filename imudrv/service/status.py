@@ -26,6 +26,8 @@ class PortStatus:
         As in the settings.
     state, trouble : str
         Fields of `imudrv.diagnosis.LineState`.
+    users : list of str
+        Other programs that have the port open; looked for after losses only.
     reconnects : int
         Number of times that a lost port was opened again.
     source : str
@@ -35,6 +37,7 @@ class PortStatus:
     url: str
     state: str
     trouble: str
+    users: list[str]
     reconnects: int
     source: str
 
@@ -192,6 +195,8 @@ class Status:
         """What a person should look at although samples are output."""
         warnings = [f"unit: {name}" for name in self.unit_status.faults]
         warnings += [f"{sink.url}: {sink.state}" for sink in self.sinks if not sink.healthy]
+        if self.port.users:
+            warnings.append(f"port also open in {', '.join(self.port.users)}")
         if self.samples.lost_last_s:
             warnings.append(f"{self.samples.lost_last_s} samples lost in the last second")
         if self.port.state == "streaming" and not self.clock.locked:
