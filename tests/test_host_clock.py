@@ -4,18 +4,24 @@ import os
 import pty
 import tty
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from mcap.writer import Writer
 from samples import CERTIFICATE
 
 from imudrv import compensate, profiles
-from imudrv.calibration import write_calibration
+from imudrv.calibration import coefficients, write_calibration
 from imudrv.errors import InputError
 from imudrv.hostclock import Readings, now_ns, read_clocks
 from imudrv.imu.clock import ClockModel
+from imudrv.imu.rate_filter import rate_filter
+from imudrv.pipeline import Pipeline
 from imudrv.recording import format
 from imudrv.recording.pack import pack
 from imudrv.recording.reader import Recording
@@ -161,7 +167,7 @@ class Collected(Sink):
         pass
 
 
-def settings(folder: Path, port: str, profile: str, **others: str) -> Settings:
+def service_settings(folder: Path, port: str, profile: str, **others: str) -> Settings:
     write_calibration(folder / "unit.yaml", NOMINAL)
     return Settings(
         port=port,
@@ -202,7 +208,7 @@ def test_stamps_follow_a_step_and_a_replay_and_the_offline_command_give_the_same
             host.real_ns += step_ns
 
     sink = Collected(host, act)
-    own = settings(tmp_path, scenario(tmp_path), profile, record=str(tmp_path / "run.mcap"))
+    own = service_settings(tmp_path, scenario(tmp_path), profile, record=str(tmp_path / "run.mcap"))
     service = Service(own, said.append, [sink], clock_watch=ClockWatch(host.read))
     run(service)
     live = np.concatenate(sink.pieces)
@@ -226,7 +232,7 @@ def test_stamps_follow_a_step_and_a_replay_and_the_offline_command_give_the_same
     again = Collected(Host(), lambda _: None)
     run(
         Service(
-            settings(tmp_path, f"replay://{tmp_path / 'run.mcap'}?speed=max", profile),
+            service_settings(tmp_path, f"replay://{tmp_path / 'run.mcap'}?speed=max", profile),
             lambda _: None,
             [again],
             clock_watch=ClockWatch(Host().read),
@@ -241,7 +247,7 @@ def test_stamps_follow_a_step_and_a_replay_and_the_offline_command_give_the_same
 def test_events_and_status_have_the_time_of_the_clock_that_was_set(tmp_path: Path) -> None:
     host, said = Host(), list[str]()
     sink = Collected(host, lambda _: None)
-    own = settings(tmp_path, scenario(tmp_path), "imu50-rs422")
+    own = service_settings(tmp_path, scenario(tmp_path), "imu50-rs422")
     service = Service(own, said.append, [sink], clock=lambda: host.now_ns, clock_watch=ClockWatch(host.read))
     try:
         service.step()
@@ -270,7 +276,7 @@ def test_a_sleep_of_12_s_is_a_gap_of_12_000_samples_and_the_stamps_are_right_aft
     tty.setraw(slave)
     said: list[str] = []
     sink = Collected(Host(), lambda _: None)
-    own = settings(tmp_path, os.ttyname(slave), "imu50-rs422", record=str(tmp_path / "run.mcap"))
+    own = service_settings(tmp_path, os.ttyname(slave), "imu50-rs422", record=str(tmp_path / "run.mcap"))
     service = Service(own, said.append, [sink], clock=lambda: host.now_ns, clock_watch=ClockWatch(host.read))
 
     def play(first: int, count: int) -> None:
@@ -337,6 +343,35 @@ def test_a_recording_keeps_the_timebase_of_each_read(tmp_path: Path) -> None:
     assert list(Recording(tmp_path / "run.mcap").arrivals()) == arrivals
     pack(tmp_path / "run.mcap", tmp_path / "packed.mcap")
     assert list(Recording(tmp_path / "packed.mcap").arrivals()) == arrivals
+
+
+@given(
+    cuts=st.lists(st.integers(0, 44 * 700), max_size=20),
+    bases=st.lists(st.sampled_from([Timebase(), Timebase(HOUR), Timebase(-HOUR, 12 * S)]), min_size=1),
+    flips=st.lists(st.integers(0, 44 * 700 - 1), max_size=5),
+)
+@settings(deadline=None, max_examples=25)
+def test_live_and_offline_agree_wherever_the_steps_and_the_reads_fall(
+    cuts: list[int], bases: list[Timebase], flips: list[int]
+) -> None:
+    wire = bytearray(frames(0, 400) + frames(900, 300))  # the first frame after the jump waits for the next
+    for at in flips:
+        wire[at] ^= 0x10
+    edges = [0, *sorted(cuts), 44 * 400, 44 * 401, len(wire)]
+    reads = [bytes(wire[a:b]) for a, b in pairwise(sorted(edges)) if a < b]
+    arrivals = [Arrival(BEGIN + k * MS, data, bases[k % len(bases)]) for k, data in enumerate(reads)]
+    pipeline = Pipeline(profiles.load("imu50-rs422"), coefficients(NOMINAL), rate_filter("dither", MS))
+    live = []
+    with TemporaryDirectory() as folder:
+        kept = recorder(Path(folder) / "run.mcap")
+        for arrival in arrivals:
+            kept.arrived(arrival)
+            pipeline.clock.follow(arrival.timebase)
+            live.append(pipeline.feed(arrival.data, arrival.t_ns).increments)
+        live.append(pipeline.close().increments)
+        kept.close()
+        offline = compensate(Path(folder) / "run.mcap", NOMINAL, rate_filter="dither")
+    np.testing.assert_array_equal(offline, np.concatenate(live))
 
 
 def wire_only(path: Path, clock: bytes | None) -> None:
