@@ -92,6 +92,7 @@ def _range(limits: tuple[float, float]) -> tuple[float, float]:
 # Wide enough for any unit of the kind, narrow enough to catch another unit of measure.
 GyroScale = Annotated[float, Key(gt=1e-9, le=1e4)]
 AccelerometerScale = Annotated[float, Key(gt=1e-9, le=1e9)]
+Scale = Annotated[float, Key(ge=0.5, le=2.0)]
 GyroBias = Annotated[float, Key(ge=-3600, le=3600)]
 AccelerometerBias = Annotated[float, Key(ge=-1e5, le=1e5)]
 GyroBiasSlope = Annotated[float, Key(ge=-100, le=100)]
@@ -110,19 +111,46 @@ def _array(values: object, unit: float = 1.0) -> Array:
 
 
 class Gyro(Model):
-    """The gyros: ``dtheta_b = C_bg @ (scale * N) - bias * tau``."""
+    """The gyros: ``dtheta_b = C_bg @ (scale * N) - bias * tau``.
 
-    scale_arcsec_per_pulse: tuple[GyroScale, GyroScale, GyroScale]
+    N are pulses, or angles of a unit that sends them in angular units; then the scale is about 1.
+    """
+
+    scale_arcsec_per_pulse: tuple[GyroScale, GyroScale, GyroScale] | None = None
+    scale: tuple[Scale, Scale, Scale] | None = None
     bias_deg_per_h: tuple[GyroBias, GyroBias, GyroBias]
     C_bg: Axes
 
+    @model_validator(mode="after")
+    def _has_one_scale(self) -> Self:
+        _require_one(self.scale_arcsec_per_pulse, "scale_arcsec_per_pulse", self.scale)
+        return self
+
 
 class Accelerometer(Model):
-    """The accelerometers: ``dv_b = C_ba @ (N / scale - bias * tau)``."""
+    """The accelerometers: ``dv_b = C_ba @ (N / scale - bias * tau)``.
 
-    scale_pulse_per_m_s: tuple[AccelerometerScale, AccelerometerScale, AccelerometerScale]
+    N are pulses, or velocities of a unit that sends them in units of velocity; then the scale is about 1.
+    """
+
+    scale_pulse_per_m_s: tuple[AccelerometerScale, AccelerometerScale, AccelerometerScale] | None = None
+    scale: tuple[Scale, Scale, Scale] | None = None
     bias_ug: tuple[AccelerometerBias, AccelerometerBias, AccelerometerBias]
     C_ba: Axes
+
+    @model_validator(mode="after")
+    def _has_one_scale(self) -> Self:
+        _require_one(self.scale_pulse_per_m_s, "scale_pulse_per_m_s", self.scale)
+        return self
+
+
+def _require_one(of_pulses: object, name: str, scale: object) -> None:
+    if (of_pulses is None) == (scale is None):
+        came = "neither" if scale is None else "both"
+        raise ValueError(
+            f"expected {name} for a unit that sends pulses, or scale (three numbers about 1) for one that "
+            f"sends other units, got {came}"
+        )
 
 
 class SensingPoints(Model):
@@ -299,10 +327,10 @@ def coefficients(calibration: Calibration) -> Coefficients:
     """
     gyro, accelerometer, terms = calibration.gyro, calibration.accelerometer, calibration.temperature
     return Coefficients(
-        gyro_scale=_array(gyro.scale_arcsec_per_pulse, ARCSEC),
+        gyro_scale=_array(gyro.scale_arcsec_per_pulse or gyro.scale, ARCSEC if gyro.scale is None else 1.0),
         gyro_bias=_array(gyro.bias_deg_per_h, DEG_PER_H),
         C_bg=_array(gyro.C_bg),
-        accelerometer_scale=_array(accelerometer.scale_pulse_per_m_s),
+        accelerometer_scale=_array(accelerometer.scale_pulse_per_m_s or accelerometer.scale),
         accelerometer_bias=_array(accelerometer.bias_ug, UG),
         C_ba=_array(accelerometer.C_ba),
         r_b=calibration.size_effect.r_m if calibration.size_effect else None,
@@ -316,4 +344,6 @@ def coefficients(calibration: Calibration) -> Coefficients:
         )
         if terms
         else None,
+        gyro_in_pulses=gyro.scale is None,
+        accelerometer_in_pulses=accelerometer.scale is None,
     )

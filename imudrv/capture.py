@@ -163,7 +163,9 @@ class Capture:
             one does. Or a log has several channels and none was chosen, or not the chosen one.
         """
         self._begin()
-        self._clock = ClockModel(self.layout.interval_ns, self.profile.transmission_ns)
+        self._clock = ClockModel(
+            self.layout.interval_ns, self.profile.transmission_ns, self.layout.counter_step
+        )
         for frames in self._frames(advance):
             if not len(self._counters):
                 self._counters = frames["counter"].copy()

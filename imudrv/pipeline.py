@@ -50,7 +50,7 @@ class Pipeline:
         self._rate_filter = rate_filter
         self.decoder = FrameDecoder(self._layout)
         self.tracker = SequenceTracker(self._layout)
-        self.clock = ClockModel(self._layout.interval_ns, profile.transmission_ns)
+        self.clock = ClockModel(self._layout.interval_ns, profile.transmission_ns, self._layout.counter_step)
         self._compensator = Compensator(coefficients, self._layout, rate_filter)
         self._next: Compensator | None = None
         self._repeats = False

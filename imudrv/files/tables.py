@@ -106,7 +106,8 @@ class CsvTable:
         if not self._begun:
             self._begun = True
             self._file.write((",".join(names) + "\n").encode())
-        self._file.write("".join(",".join(map(repr, row)) + "\n" for row in zip(*flat, strict=True)).encode())
+        text = "".join(",".join(map(repr, row)) + "\n" for row in zip(*flat, strict=True))
+        self._file.write(text.replace("nan", "").encode())  # numbers only: NaN is an absent one
 
     def finish(self) -> None:
         """Do nothing: all rows are written."""

@@ -53,7 +53,9 @@ _EDGES_NS: Final = tuple(round(edge * NS_PER_S) for edge in STALL_EDGES_S)
 _UNLOCKED: Final = int(Flag.CLOCK_UNLOCKED)
 _STEPPED: Final = int(Flag.CLOCK_STEPPED)
 
-CONSTANTS: Final = np.dtype([("interval_ns", np.int64), ("transmission_ns", np.int64)])
+CONSTANTS: Final = np.dtype(
+    [("interval_ns", np.int64), ("transmission_ns", np.int64), ("counter_step", np.int64)]
+)
 """Parameters of `ClockModel`."""
 
 STATE: Final = np.dtype(
@@ -135,10 +137,12 @@ class ClockModel:
         Sample interval.
     transmission_ns : int, optional
         Least time from the end of an interval to the arrival: a frame's time on the wire.
+    counter_step : int, optional
+        Change of the counter from a sample to the next.
     """
 
-    def __init__(self, interval_ns: int, transmission_ns: int = 0) -> None:
-        self._constants = np.array([(interval_ns, transmission_ns)], CONSTANTS)
+    def __init__(self, interval_ns: int, transmission_ns: int = 0, counter_step: int = 1) -> None:
+        self._constants = np.array([(interval_ns, transmission_ns, counter_step)], CONSTANTS)
         self._state = np.zeros(1, STATE)
         self._points = room_for_points(WINDOW_NS)
         self._stamps = np.empty(_ROOM, STAMP)
@@ -272,14 +276,14 @@ def _place(sample: np.void, c: np.void, s: np.void, points: NDArray[np.int64]) -
     e = s["envelope"]
     arrival_ns = min(max(sample["arrival_ns"], 0), _LATEST_NS) - c["transmission_ns"]
     dx = sample["elapsed_ns"] - s["elapsed_ns"]
-    steps = sample["counter"] - s["counter"]
+    steps = (sample["counter"] - s["counter"]) // c["counter_step"]
     x = sample["elapsed_ns"] - s["origin_x"]
     y = arrival_ns - sample["elapsed_ns"] - s["origin_y"]
     continues = (
         s["started"]
         and not s["woken"]
         and steps > 0
-        and dx == steps * c["interval_ns"]
+        and 0 <= dx - steps * c["interval_ns"] <= steps  # an interval may be a fraction of 1 ns longer
         and arrival_ns > s["arrival_ns"] - _EARLY_NS
     )
     if continues and x >= e["bin_end"]:

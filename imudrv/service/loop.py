@@ -109,7 +109,9 @@ class Service:
         self._layout = self._profile.layout()
         self._recordings = Recordings(self._create_recorder, history)
         self._events = EventLog(say, warn or say, self._recordings.event, clock)
-        self._calibration = CalibrationWatch(Path(settings.calibration), settings.unit, self._events)
+        self._calibration = CalibrationWatch(
+            Path(settings.calibration), settings.unit, self._layout, self._events
+        )
         self._port = PortSupervisor(settings.port, self._profile, in_real_time, self._events, clock)
         self._pipeline = Pipeline(
             self._profile,

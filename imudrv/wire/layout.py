@@ -329,14 +329,19 @@ class Layout:
         return int(self.interval)
 
     @property
+    def counter_step(self) -> int:
+        """Change of a sample's `counter` from one to the next."""
+        return int(self.sequence.step) if self.sequence.kind is SequenceKind.COUNTER else 1
+
+    @property
     def sensors(self) -> tuple[Sensor, Sensor]:
         """Gyros and accelerometers."""
         return self.gyro, self.accelerometer
 
     @property
-    def missing_axes(self) -> tuple[tuple[bool, ...], tuple[bool, ...]]:
-        """Of the gyros and of the accelerometers: whether the unit lacks X, Y, Z."""
-        gyro, accelerometer = (tuple(axis is None for axis in sensor.axes) for sensor in self.sensors)
+    def missing_axes(self) -> tuple[list[int], list[int]]:
+        """Axes that the unit lacks, 0 to 2: of the gyros and of the accelerometers."""
+        gyro, accelerometer = ([k for k in range(3) if sensor.axes[k] is None] for sensor in self.sensors)
         return gyro, accelerometer
 
     @property
