@@ -76,6 +76,20 @@ def interrupted(*arguments):
 loop.warm_up = interrupted
 {RUN}"""
 
+INTERRUPTED_AFTER_Y_UP = f"""
+import os, signal
+from calib.bench.entries import AcceptedStep
+from calib.bench.session import Session
+append = Session.append
+
+def appended(session, entry):
+    append(session, entry)
+    if isinstance(entry, AcceptedStep) and entry.step_id == "y-up":
+        os.kill(os.getpid(), signal.SIGINT)
+
+Session.append = appended
+{RUN}"""
+
 
 def start(folder: Path, *redo: str, program: str = RUN) -> subprocess.Popen[str]:
     """Begin or resume a rehearsal."""
@@ -276,10 +290,9 @@ def test_only_the_step_with_a_gap_in_its_recording_is_done_again(
     tmp_path: Path,
 ) -> None:
     folder = tmp_path / "holed"
-    process = start(folder)
-    until(process, lambda: "y-up" in accepted_in(folder))
-    process.send_signal(signal.SIGINT)
-    process.communicate(timeout=DEADLINE_S)
+    process = start(folder, program=INTERRUPTED_AFTER_Y_UP)
+    out, err = process.communicate(timeout=DEADLINE_S)
+    assert process.returncode == 130, out + err
     assert accepted_in(folder) == STEPS
     # A session of the first version: it began to record x-up when half of the alignment was over.
     path = folder / "run-x-up-1.mcap"

@@ -28,6 +28,7 @@ from imudrv.files import settings_file
 from imudrv.records import Records
 from imudrv.sim.capture import wire
 from imudrv.sim.links import pty, serial, tcp
+from imudrv.sim.links.base import LineOptions
 from imudrv.sim.live import MOST, Pace, PacedPlayback, Played, play
 from imudrv.sim.scenario import Scenario
 from imudrv.url import speed_of
@@ -162,6 +163,25 @@ def test_an_unplugged_pty_reappears_under_its_link(scenario: Make, player: Playe
     assert not link.is_symlink()
     silent = run.model_copy(update={"faults": run.faults.model_copy(update={"unplugs": ()})})
     assert len(whole(silent, RS422)) > len(whole(run, RS422))
+
+
+def test_a_reader_that_leaves_in_the_middle_of_a_write_does_not_end_the_run(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    said: list[str] = []
+    line = pty.SimulatedPty(LineOptions("unit", False, said.append, threading.Event()), None)
+    readers = [os.open(said[0].split()[-1], os.O_RDONLY | os.O_NOCTTY)]
+    ready = select.select
+
+    def leaving(*arguments: Any) -> Any:
+        while readers:
+            os.close(readers.pop())
+        return ready(*arguments)
+
+    monkeypatch.setattr(select, "select", leaving)
+    line.send(bytes(44))
+    line.close()
+    assert (line.sent, line.undelivered) == (0, 44)
 
 
 def test_a_link_never_leads_to_a_closed_pty(
