@@ -8,7 +8,7 @@ from imudrv import Source
 from imudrv.errors import InputError
 from imudrv.ports import PortEndedError, PortLostError, open_port, replay
 from imudrv.recording.format import BYTES, CAN_MESSAGES, WIRE, pack_messages
-from imudrv.records import MESSAGE
+from imudrv.records import MESSAGE, Arrival
 from imudrv.wire.candump import format_candump
 
 FRAME = 44  # bytes of imu50-rs422
@@ -114,7 +114,7 @@ def _recording(path, encoding, reads):
         writer = Writer(file)
         writer.start()
         channel = writer.register_channel(WIRE, encoding, 0)
-        for t_ns, data in reads:
+        for t_ns, data, *_ in reads:
             writer.add_message(channel, t_ns, data, t_ns)
         writer.finish()
     return path
@@ -123,7 +123,7 @@ def _recording(path, encoding, reads):
 @pytest.mark.parametrize("speed", ["max", "50"])
 def test_a_recording_is_replayed_read_by_read_with_its_times(speed, rs422, tmp_path, opened, to_the_end):
     start = 1_700_000_000_123_456_789
-    reads = [(start + k * 3 * MS, bytes([k % 256] * (1 + k % 50))) for k in range(500)]
+    reads = [Arrival(start + k * 3 * MS, bytes([k % 256] * (1 + k % 50))) for k in range(500)]
     path = _recording(tmp_path / "unit.mcap", BYTES, reads)
     assert to_the_end(opened(f"replay://{path}?speed={speed}", rs422)) == reads
 
