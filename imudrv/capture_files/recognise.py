@@ -45,7 +45,7 @@ DATAGRAMS: Final = Kind(
     "increments as I50N datagrams",
     "",
     ".i50n",
-    "they are compensated already and hold no pulses; read them with imudrv.read_increments",
+    "they are compensated already and hold no pulses; write them as a table with `imudrv export --to csv`",
 )
 
 _UNPACK: Final = "unpack it, and give the file inside"

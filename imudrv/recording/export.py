@@ -26,11 +26,14 @@ from imudrv.recording.ros2 import export_ros2
 from imudrv.recording.waypoint import export_imr
 from imudrv.records import INCREMENTS, Flag, Records
 from imudrv.wire.candump import format_candump
+from imudrv.wire.datagram import DatagramDecoder
 
 T = TypeVar("T")
 
 KINDS: Final = ("csv", "npz", "raw", "candump", "imr", "ros2")
 """Names of the formats."""
+_TABLES: Final = ("csv", "npz")
+_CHUNK_BYTES: Final = 76 << 12
 
 
 class Exported(NamedTuple):
@@ -93,6 +96,52 @@ def export(recording: Recording, kind: str, target: Path) -> Exported:
         export_ros2(recording, counted(), target)
     else:
         _export_table(f".{kind}", counted(), target)
+    return Exported(samples, invalid)
+
+
+def export_datagrams(path: Path, kind: str, target: Path) -> Exported:
+    """Write the increments of a file of datagrams (``.i50n``) as a table; counters are modulo 2^32.
+
+    Parameters
+    ----------
+    path : Path
+        Datagrams back to back; the last one may be cut.
+    kind : {'csv', 'npz'}
+        The format.
+    target : Path
+        See `export`.
+
+    Returns
+    -------
+    Exported
+
+    Raises
+    ------
+    InputError
+        Another kind, a file that holds other bytes or cannot be read, or a target that cannot be written.
+    """
+    if kind not in _TABLES:
+        raise InputError(f"--to: expected {' or '.join(_TABLES)} for increments ({path}), got {kind!r}")
+    require_other(target, path)
+    decoder = DatagramDecoder()
+    samples = invalid = 0
+
+    def pieces() -> Iterator[Records]:
+        nonlocal samples, invalid
+        try:
+            with path.open("rb") as file:
+                while data := file.read(_CHUNK_BYTES):
+                    increments, _, rejects = decoder.feed(data)
+                    if rejects.size:
+                        place = rejects["offset"][0]
+                        raise InputError(f"{path}: byte {place}: expected I50N datagrams, got other bytes")
+                    yield increments
+                    samples += increments.size
+                    invalid += int(np.count_nonzero(increments["flags"] & Flag.VALID == 0))
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+
+    _export_table(f".{kind}", pieces(), target)
     return Exported(samples, invalid)
 
 
