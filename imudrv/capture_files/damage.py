@@ -5,8 +5,8 @@ from typing import Final
 
 _FEWEST: Final = 8
 """Number of occurrences from which a sign is no chance."""
-_LONG_ENOUGH: Final = 4096
-"""Bytes among which a counter passes through all values of a byte."""
+_LONG_ENOUGH: Final = 1 << 14
+"""Bytes in which the counter of frames of up to 64 bytes passes through all values of a byte."""
 _AT_ONCE: Final = 1 << 12
 _ODD_RUN: Final = re.compile(rb"(?<!\xff)(?:\xff\xff)*\xff(?!\xff)")
 _LONE_LF: Final = re.compile(rb"(?<!\r)\n")
