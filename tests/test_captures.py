@@ -75,10 +75,10 @@ def lost(counts: SampleCounts) -> int:
     return counts.expected - counts.good
 
 
-@pytest.mark.parametrize("name", [*CAN_FORMS, *SERIAL_FORMS])
+@pytest.mark.parametrize("name", [*CAN_FORMS, *SERIAL_FORMS, "canfd.log"])
 @pytest.mark.parametrize("is_named", [True, False], ids=["with profile", "without profile"])
 def test_a_capture_is_whole_in_every_form(logs: Path, name: str, is_named: bool) -> None:
-    profile = "imu50-can" if name in CAN_FORMS else "imu50-rs422"
+    profile = {"canfd.log": "imu50-canfd"}.get(name, "imu50-can" if name in CAN_FORMS else "imu50-rs422")
     pulses, capture = read(logs / name, profile if is_named else None)
     assert capture.profile.name == profile
     assert rows_of(pulses) == truth_of(logs / "imu50-a.truth.csv")

@@ -35,7 +35,7 @@ _EXTRAS: Final[tuple[Extra, ...]] = get_args(Extra)
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     add = parser.add_argument
-    text = "wire bytes, candump logs, or recordings (.mcap), which contain their profile"
+    text = "wire bytes, CAN logs, or recordings (.mcap), which contain their profile"
     add("captures", type=Path, nargs="+", metavar="CAPTURE", help=text)
     add_profile(parser)
     add_channel(parser)
