@@ -1,6 +1,8 @@
 """Every form in which a capture comes gives the same samples, or says what it is and what to do."""
 
 import gzip
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -73,10 +75,10 @@ def lost(counts: SampleCounts) -> int:
     return counts.expected - counts.good
 
 
-@pytest.mark.parametrize("name", [*CAN_FORMS, *SERIAL_FORMS])
+@pytest.mark.parametrize("name", [*CAN_FORMS, *SERIAL_FORMS, "canfd.log"])
 @pytest.mark.parametrize("is_named", [True, False], ids=["with profile", "without profile"])
 def test_a_capture_is_whole_in_every_form(logs: Path, name: str, is_named: bool) -> None:
-    profile = "imu50-can" if name in CAN_FORMS else "imu50-rs422"
+    profile = {"canfd.log": "imu50-canfd"}.get(name, "imu50-can" if name in CAN_FORMS else "imu50-rs422")
     pulses, capture = read(logs / name, profile if is_named else None)
     assert capture.profile.name == profile
     assert rows_of(pulses) == truth_of(logs / "imu50-a.truth.csv")
@@ -181,3 +183,39 @@ def two_channels(logs: Path, path: Path) -> tuple[Path, tuple[str, str]]:
             message.channel = int(message.channel.removeprefix("can"))  # the formats count from 1
             writer.on_message_received(message)
     return path, ("1", "2")
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "code", "message"),
+    [
+        ("base.blf", [], 0, "base.blf: imu50-can, 14122 bytes of a Vector BLF log -> out.csv"),
+        ("base.raw.gz", [], 0, "profile imu50-rs422: found, for it fits best of the shipped ones"),
+        ("any.log", [], 2, "got those of can0 and can1; choose one, as with --channel can0"),
+        ("base.asc", ["--profile", "imu50-rs422"], 2, "expected wire bytes for imu50-rs422, got an ASC log"),
+        ("xxd.txt", ["--profile", "imu50-can"], 2, "expected a CAN log for imu50-can, got a hex dump"),
+        (
+            "base.raw",
+            ["--profile", "imu50-can"],
+            2,
+            "got none in 35200 bytes of binary data; its beginning has",
+        ),
+        ("README.md", [], 2, "got text of no known form, which none of them fits; choose the unit's with"),
+    ],
+)
+def test_the_command_says_what_it_read_or_why_not(
+    logs: Path, tmp_path: Path, name: str, arguments: list[str], code: int, message: str
+) -> None:
+    command = [sys.executable, "-m", "imudrv", "decode", str(logs / name), *arguments, "-o", "out.csv"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == code
+    assert message in (done.stderr if code else done.stdout)
+    assert (tmp_path / "out.csv").exists() == (code == 0)
+    assert "Traceback" not in done.stderr
+
+
+def test_two_profiles_that_fit_equally_well_are_named(logs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    twin = imudrv.load_profile("imu50-rs422")
+    monkeypatch.setattr("imudrv.capture.profiles.shipped", lambda: ["imu50-rs422", "twin"])
+    monkeypatch.setattr("imudrv.capture.profiles.load", lambda name: twin.model_copy(update={"name": name}))
+    with pytest.raises(InputError, match="fits imu50-rs422 and twin equally well; choose one with --profile"):
+        imudrv.Capture(logs / "base.raw")

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from imudrv import profiles
+from imudrv.cli import main
 from imudrv.errors import InputError
-from imudrv.recording.export import KINDS, export
+from imudrv.recording.export import KINDS, export, export_datagrams
 from imudrv.recording.reader import Recording
 from imudrv.records import INCREMENTS, MESSAGE, PULSES, Arrival, Records, Source
 from imudrv.sinks.base import Batch
@@ -75,6 +76,24 @@ def test_tables_have_the_recorded_increments_to_the_bit(recorded: Recording, tmp
         assert np.array_equal(table[name], expected[f"{name}_b"])
         for k, axis in enumerate("xyz"):
             assert np.array_equal(rows[f"{name}_{axis}"], expected[f"{name}_b"][:, k])
+
+
+def test_a_file_of_datagrams_becomes_the_same_table(
+    recorded: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sent = encode(np.concatenate(list(recorded.increments())), Source.SIMULATOR)
+    source = tmp_path / "out.i50n"
+    source.write_bytes(sent + sent[:40])  # cut
+    assert export(recorded, "csv", tmp_path / "recording.csv") == (SAMPLES, 2)
+    assert export_datagrams(source, "csv", tmp_path / "file.csv") == (SAMPLES, 2)
+    assert (tmp_path / "file.csv").read_bytes() == (tmp_path / "recording.csv").read_bytes()
+    assert main(["export", str(source), "--to", "npz", "-o", str(tmp_path / "file.npz")]) == 0
+    assert len(np.load(tmp_path / "file.npz")["counter"]) == SAMPLES
+    source.write_bytes(sent[:76] + b"x" + sent)
+    for kind, message in (("csv", "byte 76: expected I50N datagrams"), ("imr", "expected csv or npz")):
+        assert main(["export", str(source), "--to", kind, "-o", str(tmp_path / "bad.csv")]) == 2
+        assert message in capsys.readouterr().err
+    assert not (tmp_path / "bad.csv").exists()
 
 
 def test_raw_is_the_bytes_of_the_wire(recorded: Recording, tmp_path: Path) -> None:

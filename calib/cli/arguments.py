@@ -24,7 +24,7 @@ def add_gauge(parser: argparse.ArgumentParser, option: str, **more: Any) -> None
 
 def add_channel(parser: argparse.ArgumentParser) -> None:
     """Add ``--channel``."""
-    parser.add_argument("--channel", metavar="NAME", help="CAN channel of candump logs, such as can0")
+    parser.add_argument("--channel", metavar="NAME", help="channel of CAN logs, such as can0")
 
 
 def add_certificate_output(parser: argparse.ArgumentParser) -> None:

@@ -32,7 +32,7 @@ EXAMPLE: Final = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     add = parser.add_argument
-    text = "wire bytes, candump logs, or recordings (.mcap), which contain their profile"
+    text = "wire bytes, CAN logs, or recordings (.mcap), which contain their profile"
     add("captures", type=Path, nargs="+", metavar="CAPTURE", help=text)
     add_profile(parser)
     add_channel(parser)

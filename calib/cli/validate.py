@@ -34,7 +34,7 @@ NOT_GOOD: Final = 3
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     add = parser.add_argument
-    text = "rest, motion, rest: wire bytes, candump logs, or recordings (.mcap)"
+    text = "rest, motion, rest: wire bytes, CAN logs, or recordings (.mcap)"
     add("recordings", type=Path, nargs="*", metavar="RECORDING", help=text)
     text = "simulate units, with lever arms from a simulated procedure"
     add("--simulate", choices=(*TRIALS, "all"), help=text)

@@ -4,6 +4,7 @@ The log's own times and channel numbers stay as they are; a format without chann
 has the identifier that candump gives it, so that it is counted as one.
 """
 
+import logging
 import sqlite3
 import struct
 import zlib
@@ -15,6 +16,9 @@ import can
 
 from imudrv.capture_files.source import Source
 from imudrv.errors import InputError
+
+# What is wrong in a log is in our messages and counts; without a handler python-can prints it, too.
+logging.getLogger("can").addHandler(logging.NullHandler())
 
 _ERROR_FLAG, _ID_MASK = 1 << 29, (1 << 29) - 1
 _NO_CHANNEL: Final = "can"

@@ -5,8 +5,9 @@ from typing import Final
 
 _FEWEST: Final = 8
 """Number of occurrences from which a sign is no chance."""
-_LONG_ENOUGH: Final = 4096
-"""Bytes among which a counter passes through all values of a byte."""
+_LONG_ENOUGH: Final = 1 << 14
+"""Bytes in which the counter of frames of up to 64 bytes passes through all values of a byte."""
+_AT_ONCE: Final = 1 << 12
 _ODD_RUN: Final = re.compile(rb"(?<!\xff)(?:\xff\xff)*\xff(?!\xff)")
 _LONE_LF: Final = re.compile(rb"(?<!\r)\n")
 _FLOW_CONTROL: Final = re.compile(rb"[\x11\x13]")
@@ -26,9 +27,12 @@ class DamageSigns:
     def feed(self, data: bytes) -> None:
         """Examine further bytes."""
         self._bytes += len(data)
-        if not (self._is_text_mode or self._is_flow_control or self._is_doubled):
-            return
-        data = self._last + data
+        for begin in range(0, len(data), _AT_ONCE):
+            if not (self._is_text_mode or self._is_flow_control or self._is_doubled):
+                return
+            self._examine(self._last + data[begin : begin + _AT_ONCE])
+
+    def _examine(self, data: bytes) -> None:
         if self._is_text_mode:
             self._is_text_mode = _LONE_LF.search(data) is None
             self._line_feeds += data.count(b"\n")

@@ -15,6 +15,7 @@ _JOINED_BYTES: Final = 1 << 17
 
 _READERS: Final = {
     recognise.HEX_DUMP: "hex_dump.read_hex_dump",
+    recognise.CANDUMP_DIFFERENCES: "screen.read_differences",
     recognise.CANDUMP_SCREEN: "screen.read_screen",
     recognise.ASC: "can_logs.read_asc",
     recognise.BLF: "can_logs.read_blf",

@@ -1,6 +1,8 @@
 """What a capture file is. The suffix of its name chooses, the content is checked."""
 
 import re
+from collections.abc import Iterable
+from itertools import pairwise
 from pathlib import PurePath
 from typing import Final, Literal, NamedTuple
 
@@ -31,6 +33,7 @@ class Kind(NamedTuple):
 WIRE_BYTES: Final = Kind("wire bytes", "serial")
 HEX_DUMP: Final = Kind("a hex dump", "serial")
 CANDUMP_LOG: Final = Kind("a candump log", "can")
+CANDUMP_DIFFERENCES: Final = Kind("a candump log of time differences", "can")
 CANDUMP_SCREEN: Final = Kind("a log in the screen format of candump", "can")
 ASC: Final = Kind("an ASC log", "can", ".asc")
 BLF: Final = Kind("a Vector BLF log", "can", ".blf")
@@ -45,7 +48,7 @@ DATAGRAMS: Final = Kind(
     "increments as I50N datagrams",
     "",
     ".i50n",
-    "they are compensated already and hold no pulses; read them with imudrv.read_increments",
+    "they are compensated already and hold no pulses; write them as a table with `imudrv export --to csv`",
 )
 
 _UNPACK: Final = "unpack it, and give the file inside"
@@ -87,6 +90,9 @@ _BY_LINE: Final = (
     (rb"^(?:[0-9A-F]{2} +){3,}[0-9A-F]{2} *\r?$|^[0-9A-F]{32,}\r?$", HEX_DUMP),
     (rb"^[0-9A-F]{4,16}(?::| ) ?(?:[0-9A-F]{2}){1,16} +[0-9A-F]{2}", HEX_DUMP),
 )
+_TIME: Final = re.compile(rb"^ ?\((\d{1,10})\.(\d{6})\d*\) ", re.MULTILINE)
+_EPOCH_FROM_US: Final = 10**14
+_MANY_RANGES: Final = 10
 _LOOKED_AT: Final = 1 << 13
 """Number of bytes in which a line of the format has to come."""
 _CONTROL: Final = re.compile(rb"[\0-\x08\x0e-\x1a\x1c-\x1f]")
@@ -100,8 +106,28 @@ def kind_of_content(head: bytes) -> Kind | None:
     if is_text(head):
         for pattern, kind in _BY_LINE:
             if re.search(pattern, head[:_LOOKED_AT], re.MULTILINE | re.IGNORECASE):
+                if kind is CANDUMP_LOG and are_differences(_TIME.findall(head)):
+                    return CANDUMP_DIFFERENCES
                 return kind
     return None
+
+
+def are_differences(times: Iterable[tuple[bytes, bytes]]) -> bool:
+    """Return whether times of candump are those since the message before (``-t d``).
+
+    Differences go up and down over their whole range with each message; times counted from anywhere increase
+    but for channels whose messages come in turn.
+
+    Parameters
+    ----------
+    times : iterable of (bytes, bytes)
+        Digits of the seconds and of their fraction, of successive messages.
+    """
+    us = [int(seconds) * 1_000_000 + int(fraction[:6]) for seconds, fraction in times]
+    if not us or us[0] >= _EPOCH_FROM_US:
+        return False
+    travelled = sum(abs(after - before) for before, after in pairwise(us))
+    return travelled > _MANY_RANGES * (max(us) - min(us))
 
 
 def is_text(head: bytes) -> bool:

@@ -1,20 +1,20 @@
-"""What candump prints on a screen, as the lines of a candump log.
+"""What candump prints on a screen, and its logs of time differences, as the lines of a candump log.
 
       can0  150   [8]  01 00 FF FF 02 00 40 00
      (1700000000.000028)  can0  150   [8]  ..             -t a; counted from the first message: -t z
      (2023-11-14 22:13:20.000028)  can0  150   [8]  ..    -t A, read as UTC
      (000.000128)  can0  150   [8]  ..                    -t d: since the message before
 
-Without times all messages have the time 0. The text does not say whether small times count from the first
-message or from the message before; a time that decreases decides.
+Without times all messages have the time 0.
 """
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from datetime import datetime
-from itertools import chain, pairwise
+from itertools import chain
 from typing import Final
 
+from imudrv.capture_files.recognise import are_differences
 from imudrv.capture_files.source import Source
 
 _LINE: Final = re.compile(
@@ -22,9 +22,8 @@ _LINE: Final = re.compile(
     rb"(?:[RT]X [B-] [E-] +)?([0-9A-F]{3}|[0-9A-F]{8}) +\[ ?(\d\d?)\] *"
     rb"(?:(remote request)|((?:[0-9A-F]{2} ?)*))(?: +'.*'| +ERRORFRAME)?\s*"
 )
+_LOG_LINE: Final = re.compile(rb"\((\d{1,10})\.(\d{6})\d{0,3}\)(.*\n?)", re.DOTALL)
 _AT_ONCE: Final = 4096
-_EPOCH_FROM_S: Final = 10**8
-"""Smaller times count from the first message or the one before."""
 
 
 def read_screen(source: Source) -> Iterator[bytes]:
@@ -37,7 +36,8 @@ def read_screen(source: Source) -> Iterator[bytes]:
     """
     lines = iter(source)
     head = [line for line, _ in zip(lines, range(_AT_ONCE), strict=False)]
-    are_differences = _are_differences(head)
+    matches = (_LINE.fullmatch(line) for line in head)
+    has_differences = are_differences((m[2], m[3]) for m in matches if m is not None and m[2] is not None)
     text, total_us = [], 0
     for line in chain(head, lines):
         match = _LINE.fullmatch(line)
@@ -50,7 +50,7 @@ def read_screen(source: Source) -> Iterator[bytes]:
         except ValueError:  # no such date
             text.append(line)
             continue
-        if are_differences:
+        if has_differences:
             us = total_us = total_us + us
         # with two digits of length candump shows CAN FD
         data = b"R" if remote else (b"#1" if len(length) == 2 else b"") + data.replace(b" ", b"")
@@ -62,6 +62,22 @@ def read_screen(source: Source) -> Iterator[bytes]:
     yield b"".join(text)
 
 
+def read_differences(source: Source) -> Iterator[bytes]:
+    """Yield a candump log of time differences with times counted from its beginning.
+
+    Parameters
+    ----------
+    source : Source
+        Open file.
+    """
+    total_us = 0
+    for line in source:
+        if match := _LOG_LINE.fullmatch(line):
+            total_us += int(match[1]) * 1_000_000 + int(match[2])
+            line = b"(%d.%06d)%b" % (*divmod(total_us, 1_000_000), match[3])
+        yield line
+
+
 def _time_us(date: bytes | None, seconds: bytes | None, fraction: bytes | None) -> int:
     us = int(fraction[:6]) if fraction else 0
     if date:
@@ -69,12 +85,3 @@ def _time_us(date: bytes | None, seconds: bytes | None, fraction: bytes | None) 
     elif seconds:
         us += int(seconds) * 1_000_000
     return us
-
-
-def _are_differences(lines: Iterable[bytes]) -> bool:
-    """Return whether the times are those since the message before (``-t d``)."""
-    matches = (_LINE.fullmatch(line) for line in lines)
-    times = [int(m[2] + m[3][:6]) for m in matches if m is not None and m[2] is not None]
-    if not times or max(times) >= _EPOCH_FROM_S * 1_000_000:
-        return False
-    return any(after < before for before, after in pairwise(times))

@@ -24,13 +24,16 @@ from imudrv.files.tables import increment_columns, table, writing
 from imudrv.recording.reader import Recording
 from imudrv.recording.ros2 import export_ros2
 from imudrv.recording.waypoint import export_imr
-from imudrv.records import INCREMENTS
+from imudrv.records import INCREMENTS, Records
 from imudrv.wire.candump import format_candump
+from imudrv.wire.datagram import DatagramDecoder
 
 T = TypeVar("T")
 
 KINDS: Final = ("csv", "npz", "raw", "candump", "imr", "ros2")
 """Names of the formats."""
+_TABLES: Final = ("csv", "npz")
+_CHUNK_BYTES: Final = 76 << 12
 
 
 def export(recording: Recording, kind: str, target: Path) -> None:
@@ -68,10 +71,51 @@ def export(recording: Recording, kind: str, target: Path) -> None:
     elif kind == "ros2":
         export_ros2(recording, target)
     else:
-        with table(target, (f".{kind}",), {}) as rows:
-            rows.write(increment_columns(np.zeros(0, INCREMENTS)))  # columns even without a sample
-            for increments in recording.increments():
-                rows.write(increment_columns(increments))
+        _write_table(f".{kind}", recording.increments(), target)
+
+
+def export_datagrams(path: Path, kind: str, target: Path) -> None:
+    """Write the increments of a file of datagrams (``.i50n``) as a table; counters are modulo 2^32.
+
+    Parameters
+    ----------
+    path : Path
+        Datagrams back to back; the last one may be cut.
+    kind : {'csv', 'npz'}
+        The format.
+    target : Path
+        See `export`.
+
+    Raises
+    ------
+    InputError
+        Another kind, a file that holds other bytes or cannot be read, or a target that cannot be written.
+    """
+    if kind not in _TABLES:
+        raise InputError(f"--to: expected {' or '.join(_TABLES)} for increments ({path}), got {kind!r}")
+    require_other(target, path)
+    _write_table(f".{kind}", _datagrams(path), target)
+
+
+def _datagrams(path: Path) -> Iterator[Records]:
+    decoder = DatagramDecoder()
+    try:
+        with path.open("rb") as file:
+            while data := file.read(_CHUNK_BYTES):
+                increments, _, rejects = decoder.feed(data)
+                if rejects.size:
+                    place = rejects["offset"][0]
+                    raise InputError(f"{path}: byte {place}: expected I50N datagrams, got other bytes")
+                yield increments
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+
+
+def _write_table(suffix: str, pieces: Iterator[Records], target: Path) -> None:
+    with table(target, (suffix,), {}) as rows:
+        rows.write(increment_columns(np.zeros(0, INCREMENTS)))  # columns even without a sample
+        for increments in pieces:
+            rows.write(increment_columns(increments))
 
 
 def _require_transport(recording: Recording, transport: str, instead: str) -> None:

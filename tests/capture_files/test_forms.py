@@ -95,21 +95,32 @@ def test_lines_of_candumps_screen_become_those_of_its_log(tmp_path: Path) -> Non
     ]
 
 
+# two channels in turn: a message comes after one that is later
+ZERO_TIMES = [f"000.{128 * (n - n % 2 + 3 * (n % 2)):06}" for n in range(40)]
+DIFFERENCES = ["000.000000", *(f"000.{128 if n % 2 else 872:06}" for n in range(1, 40))]
+
+
+SCREEN_LINE, LOG_LINE = " ({})  can0  150   [1]  00\n", "({}) can0 150#00\n"
+EPOCH = (["1700000000.000028", "1700000000.000156"], [1_700_000_000_000_028, 1_700_000_000_000_156])
+FROM_ZERO = (ZERO_TIMES, [128 * (n - n % 2 + 3 * (n % 2)) for n in range(40)])
+SINCE_BEFORE = (DIFFERENCES, [1000 * (n // 2) + 128 * (n % 2) for n in range(40)])
+DATES = (["2023-11-14 22:13:20.000028", "2024-02-29 00:00:00.5"], [1_700_000_000_000_028, None])
+NO_MONTH = (["2023-13-14 22:13:20.000028", "2023-11-14 22:13:20.000028"], [None, 1_700_000_000_000_028])
+
+
 @pytest.mark.parametrize(
-    ("times", "t_us"),
+    ("form", "times", "t_us"),
     [
-        (["1700000000.000028", "1700000000.000156"], [1_700_000_000_000_028, 1_700_000_000_000_156]),
-        (["2023-11-14 22:13:20.000028", "2024-02-29 00:00:00.5"], [1_700_000_000_000_028, None]),
-        (["2023-13-14 22:13:20.000028", "2023-11-14 22:13:20.000028"], [None, 1_700_000_000_000_028]),
-        (["000.000000", "000.000128", "000.001000"], [0, 128, 1000]),
-        (["000.000000", "000.000128", "000.000100", "001.000000"], [0, 128, 228, 1_000_228]),
+        *((form, *times) for form in (SCREEN_LINE, LOG_LINE) for times in (EPOCH, FROM_ZERO, SINCE_BEFORE)),
+        (SCREEN_LINE, *DATES),
+        (SCREEN_LINE, *NO_MONTH),
     ],
-    ids=["-t a", "-t A", "no such month", "-t z", "-t d"],
+    ids=["-t a", "-t z", "-t d", "-L", "-L -t z", "-L -t d", "-t A", "no such month"],
 )
-def test_times_of_the_screen_format_are_those_of_the_messages(
-    tmp_path: Path, times: list[str], t_us: list[int | None]
+def test_times_of_candump_are_those_of_the_messages(
+    tmp_path: Path, form: str, times: list[str], t_us: list[int | None]
 ) -> None:
-    lines = "".join(f" ({time})  can0  150   [1]  00\n" for time in times)
+    lines = "".join(form.format(time) for time in times)
     messages, reasons = decoded(written(tmp_path, "unit.log", lines.encode()))
     assert (messages["t_ns"] // 1000).tolist() == [t for t in t_us if t is not None]
     assert len(reasons) == t_us.count(None)
