@@ -38,6 +38,7 @@ RS422, ACC, CAN, CANFD = (
 )
 LISTEN_S = (0.5, 2.0, 8.0, 30.0)
 """Times to listen until all has come: a busy machine may hold back samples, or bring them in bursts."""
+LENGTH = RS422.messages[0].length
 
 
 def scenario(duration_s: float, **sections: Any) -> Scenario:
@@ -395,6 +396,15 @@ def test_the_best_profile_is_the_one_that_reads_most() -> None:
         assert found.name == profile.name
     assert diagnosis.best_profile(every, b"") is None
     assert diagnosis.best_profile(every, np.zeros(0, MESSAGE)) is None
+
+
+def test_a_few_frames_in_noise_are_no_fit() -> None:
+    frames, noise = sent(RS422, 0.1), np.random.default_rng(1)
+    data = b"".join(frames[n * LENGTH : (n + 1) * LENGTH] + noise.bytes(1000) for n in range(20))
+    found = diagnosis.find_mismatch(ACC, data, [RS422])
+    assert found.fitting is None
+    assert not diagnosis.decode_traffic(RS422, data).fits
+    assert "check right only 20 x, as by chance" in diagnosis.find_mismatch(RS422, data, []).found
 
 
 def test_a_wrong_crc_is_distinguished_from_a_wrong_frame() -> None:

@@ -389,18 +389,22 @@ def test_a_program_that_has_the_port_open_is_named_until_it_ends(are_frames: boo
         else:
             unit.write(bytes(range(1, 200)))
 
-    with serving(folder, *serial(folder)) as service, repeating(send):
-        with (folder / "unit").open("rb") as port, subprocess.Popen(["sleep", "600"], stdin=port) as other:
-            try:
-                name = f"sleep (process {other.pid})"
-                until(lambda: name in str(service.status()["port"]["users"]), "the other program")
-                assert service.logged("port also open in ")
-                answer = service.command("status")
-                assert answer.returncode in (3, 4)
-                assert name in answer.stdout
-            finally:
-                other.kill()
-        until(lambda: name not in str(service.status()["port"]["users"]), "its end")
+    with serving(folder, *serial(folder)) as service:
+        with repeating(send):
+            with (
+                (folder / "unit").open("rb") as port,
+                subprocess.Popen(["sleep", "600"], stdin=port) as other,
+            ):
+                try:
+                    name = f"sleep (process {other.pid})"
+                    until(lambda: name in str(service.status()["port"]["users"]), "the other program")
+                    until(lambda: service.logged(name), "the line printed")
+                    answer = service.command("status")
+                    assert answer.returncode in (3, 4)
+                    assert name in answer.stdout
+                finally:
+                    other.kill()
+            until(lambda: name not in str(service.status()["port"]["users"]), "its end")
         assert service.stop() == 0
 
 

@@ -12,7 +12,9 @@ from imudrv.units import NS
 from imudrv.wire.decoder import FrameDecoder
 
 FEW: Final = 3
-"""A profile fits from this number of good frames; noise gives fewer."""
+"""A profile fits from this number of good frames on."""
+LEAST_SHARE: Final = 0.1
+"""A profile fits if its frames are at least this part of the bytes; of noise they are less."""
 RATE_TOLERANCE: Final = 0.09
 """Largest relative error of a correct rate over 3 s: a stall of 250 ms changes it by less."""
 _IDLE_BITS: Final = 3
@@ -27,6 +29,8 @@ class TrafficSummary:
     ----------
     amount : int
         Number of bytes or messages in all.
+    share : float
+        Part of the bytes that is in good frames; on CAN, where a controller checks each message, 1.
     syncs : int
         Number of sync patterns; on CAN of messages with the profile's identifiers.
     counts : SampleCounts
@@ -42,6 +46,7 @@ class TrafficSummary:
     """
 
     amount: int
+    share: float
     syncs: int
     counts: SampleCounts
     rejected: dict[Reason, int]
@@ -52,7 +57,7 @@ class TrafficSummary:
     @property
     def fits(self) -> bool:
         """Whether the data fits the profile."""
-        return self.counts.frames >= FEW
+        return self.counts.frames >= FEW and self.share >= LEAST_SHARE
 
     @property
     def is_clean(self) -> bool:
@@ -90,6 +95,7 @@ def decode_traffic(profile: Profile, data: bytes | Records) -> TrafficSummary:
     status = int(np.bitwise_or.reduce(pulses["status"])) if pulses.size else 0
     degc = pulses["temperature_degc"][-1].tolist() if pulses.size else []
     if isinstance(data, bytes):
+        share = frames.size * sum(m.length for m in profile.messages if m.every == 1) / max(len(data), 1)
         syncs = data.count(bytes.fromhex(profile.messages[0].sync or ""))
         messages = {}
     else:
@@ -97,8 +103,10 @@ def decode_traffic(profile: Profile, data: bytes | Records) -> TrafficSummary:
             m.can_id: int(np.count_nonzero(data["id"] & m.can_mask == m.can_id)) for m in layout.messages
         }
         syncs = sum(messages.values())
+        share = 1.0
     return TrafficSummary(
         len(data),
+        share,
         syncs,
         tracker.counts,
         rejected,

@@ -139,7 +139,7 @@ class PortSupervisor:
             return
         before, device = self._users, self._device
         self._users = self._user_search.poll(now_ns, lambda: holders(device.resolve())[0]) or []
-        if self._users and not before:
+        if self._users and self._users != before:
             self._events.failure(
                 f"port also open in {', '.join(self._users)}: each program receives only a part of the data"
             )
