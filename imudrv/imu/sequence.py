@@ -55,8 +55,6 @@ class SampleCounts:
     """Lost samples whose pulses are in the next running total; they are counted as lost as well."""
     unknown_gaps: int
     """Gaps with their smallest length: no time of arrival tells how often the counter went round."""
-    other_step: int
-    """Frames behind a gap as long as the gap before: many of them show a wrong step in the profile."""
 
     @property
     def closes(self) -> bool:
@@ -98,7 +96,6 @@ STATE: Final = np.dtype(
         ("fraction", np.int64),  # of a ns that is not in it, of `parts`
         ("arrival_ns", np.int64),  # of the newest frame
         ("arrivals", ARRIVALS),
-        ("advance", np.int64),  # of the newest frame behind a gap, samples
         ("lost_before", np.bool_),  # samples are missing before the next one that is output
         ("damaged", np.int64),  # frames' worth of bytes, and frames with an invalid counter, since `newest`
         ("torn", np.int64),  # samples given up before those frames
@@ -321,8 +318,6 @@ def _advance(frame: np.void, ahead: int, c: np.void, s: np.void, n: np.void) -> 
         _count_ticks(frame, ahead, c, s)
         s["received"] = (s["received"] << ahead | 1) if ahead < WINDOW else 1
         if ahead > 1:
-            n["other_step"] += ahead == s["advance"]
-            s["advance"] = ahead
             _count_lost(ahead - 1, frame, s, n)
         return ahead
     _count_behind(ahead, s, n)

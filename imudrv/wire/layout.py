@@ -334,6 +334,13 @@ class Layout:
         return int(self.sequence.step) if self.sequence.kind is SequenceKind.COUNTER else 1
 
     @property
+    def samples_a_round(self) -> Fraction:
+        """Samples until the counter or time begins anew; 1 without one: a gap may then have any length."""
+        if self.sequence.kind is SequenceKind.NONE:
+            return Fraction(1)
+        return Fraction(2**self.sequence.bits) / self.sequence.step
+
+    @property
     def sensors(self) -> tuple[Sensor, Sensor]:
         """Gyros and accelerometers."""
         return self.gyro, self.accelerometer
