@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from imudrv import load_profile
 from imudrv.capture import Capture
 from imudrv.cli import main
+from imudrv.errors import InputError
 from imudrv.imu.sequence import SampleCounts, SequenceTracker
 from imudrv.ports import Arrival, Port, open_port
 from imudrv.records import EXTENDED, Flag, Reason, Records
@@ -327,6 +328,16 @@ def test_every_unit_with_a_capture_is_described(data: Path) -> None:
         path.name.removesuffix(".truth.csv") for path in (data / "field" / "units").glob("*.truth.csv")
     }
     assert captures == set(UNITS)
+
+
+@pytest.mark.parametrize("name", UNITS)
+def test_the_profile_of_a_capture_is_found(name: str, data: Path) -> None:
+    if name.startswith("stim300-91"):
+        # Increments and totals have the same layout.
+        with pytest.raises(InputError, match="fits stim300-91 and stim300-91-totals equally well"):
+            Capture(capture_path(data, name))
+        return
+    assert Capture(capture_path(data, name)).profile.name == name
 
 
 @pytest.mark.parametrize(("name", "frames", "missing"), [("hole127", 1473, 127), ("hole200", 1400, 200)])
