@@ -92,7 +92,9 @@ def decode_traffic(profile: Profile, data: bytes | Records) -> TrafficSummary:
         frames = np.concatenate([frames, decoder.close()])  # held until their full counter arrives
     tracker = SequenceTracker(layout)
     pulses = tracker.feed(frames)
-    status = int(np.bitwise_or.reduce(pulses["status"])) if pulses.size else 0
+    active: dict[int, str] = {}
+    for status in np.unique(pulses["status"]).tolist():
+        active |= layout.active_bits(status)
     degc = pulses["temperature_degc"][-1].tolist() if pulses.size else []
     if isinstance(data, bytes):
         share = frames.size * sum(m.length for m in profile.messages if m.every == 1) / max(len(data), 1)
@@ -111,7 +113,7 @@ def decode_traffic(profile: Profile, data: bytes | Records) -> TrafficSummary:
         tracker.counts,
         rejected,
         messages,
-        tuple(name for bit, name in layout.status_names if status >> bit & 1),
+        tuple(active[mask] for mask in sorted(active)),
         dict(zip(layout.temperature_names, degc, strict=False)),
     )
 

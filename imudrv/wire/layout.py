@@ -333,6 +333,11 @@ class Layout:
         """Change of a sample's `counter` from one to the next."""
         return int(self.sequence.step) if self.sequence.kind is SequenceKind.COUNTER else 1
 
+    def active_bits(self, status: int) -> dict[int, str]:
+        """Return mask and name of the bits of a status word that apply: set, or clear if inverted."""
+        active = status ^ self.status.inverted
+        return {1 << bit: name for bit, name in self.status_names if active >> bit & 1}
+
     @property
     def samples_a_round(self) -> Fraction:
         """Samples until the counter or time begins anew; 1 without one: a gap may then have any length."""
