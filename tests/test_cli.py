@@ -139,11 +139,7 @@ def test_a_candump_log_works_for_the_can_profiles(bench: Path) -> None:
         ),
         (
             ["decode", "run.raw", "--profile", "imu51", "-o", "o.npz"],
-<<<<<<< HEAD
             "or the path of a profile file",
-=======
-            "expected one of aceinna-s1",
->>>>>>> k-u
         ),
         (
             ["decode", "run.raw", "--profile", "imu50-rs422", "-o", "o.txt"],

@@ -133,7 +133,8 @@ def line_load(profile: Profile) -> float:
     """
     line, rate = profile.line, profile.rate_hz
     if isinstance(line, SerialLine):
-        return profile.transmission_ns * NS * rate
+        others = sum(m.length for m in profile.messages if not m.is_part)  # at least one each a sample
+        return (profile.transmission_ns * NS + others * line.bits_a_byte / line.baudrate) * rate
     if line.data_bitrate is not None:
         return _STUFFING * (profile.transmission_ns * NS + _IDLE_BITS / line.bitrate) * rate
     # ISO 11898-1: a bit is stuffed after five equal ones, in 34 bits of overhead and in the data

@@ -38,6 +38,11 @@ class SerialLine(Model):
     parity: Literal["none", "even", "odd", "mark", "space"] = "none"
     stopbits: Literal[1, 2] = 1
 
+    @property
+    def bits_a_byte(self) -> int:
+        """Bits of a byte on the line: start, data, parity, stop."""
+        return 1 + self.bytesize + (self.parity != "none") + self.stopbits
+
 
 class CanLine(Model):
     """Settings of a CAN bus."""
@@ -238,8 +243,7 @@ class Profile(Model):
         parts = [m for m in self.messages if m.is_part]
         lengths = [m.length for m in parts]
         if isinstance(self.line, SerialLine):
-            bits_a_byte = 1 + self.line.bytesize + (self.line.parity != "none") + self.line.stopbits
-            return round(sum(lengths) * bits_a_byte * NS_PER_S / self.line.baudrate)
+            return round(sum(lengths) * self.line.bits_a_byte * NS_PER_S / self.line.baudrate)
         if self.line.data_bitrate is None:
             bits = sum(_CLASSIC_BITS[m.can_id[0] & EXTENDED != 0] + 8 * m.length for m in parts)
             return round(bits * NS_PER_S / self.line.bitrate)
