@@ -250,7 +250,7 @@ class CanEncoder(_Encoder):
 
 
 def _columns(numbers: list[Ints], rows: int) -> Ints:
-    return np.array(numbers, np.int64).reshape(-1, rows).T
+    return np.array(numbers, np.int64).reshape(len(numbers), rows).T
 
 
 def _limits(bits: int, signed: bool) -> tuple[int, int]:
