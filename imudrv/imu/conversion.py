@@ -117,7 +117,7 @@ def constants(layout: Layout) -> Records:
 
 
 def _fill_sensor(c: np.void, sensor: Sensor) -> None:
-    c["values"], c["in_pulses"] = sensor.values, sensor.in_pulses
+    c["values"], c["in_pulses"] = sensor.values, sensor.is_counted
     c["per_count"] = sensor.per_count
     for k, axis in enumerate(sensor.axes):
         if axis is None:

@@ -213,6 +213,14 @@ class Profile(Model):
                         f"time.step: expected {float(TICKS_PER_S[n.unit or 's'] / self.rate_hz):g} {n.unit} "
                         f"for {self.rate_hz:g} samples/s, got {n.step:g}; change one of them"
                     )
+            if n.name == "time" and not n.is_float:
+                ticks = Fraction(TICKS_PER_S[n.unit or "s"]) / self.rate
+                # Rounded times differ by up to a tick more or less, which must not be half a sample.
+                if ticks < 2 and ticks != 1:
+                    yield (
+                        f"time: expected a unit of which a sample takes 2 or more (or 1), "
+                        f"got {float(ticks):g} {n.unit} at {self.rate_hz:g} samples/s"
+                    )
             if n.name == "counter" and n.width < 64 and n.step is not None and n.step >= 1 << n.width:
                 yield (
                     f"counter.step: expected less than {1 << n.width}, for it has {n.width} bits, "
