@@ -252,7 +252,9 @@ def _forward(frames: Records, i: int, c: np.void, s: np.void) -> int:
     frame = frames[i]
     t_ns = frame["t_ns"]
     period_ns = c["span"] * c["interval_ns"]
-    is_soon = t_ns and s["arrival_ns"] and t_ns - s["arrival_ns"] < period_ns / 2
+    # When the newest frame came without delay; its own time may be that of a reader that paused.
+    newest_ns = s["arrivals"]["least_ns"] + s["elapsed_ns"]
+    is_soon = t_ns and s["arrivals"]["t_ns"] and t_ns - newest_ns < period_ns / 2
     ahead = _one_forward(frame, s["ticks"], is_soon, c)
     if t_ns == 0 or t_ns == s["arrivals"]["t_ns"]:
         return ahead

@@ -292,7 +292,7 @@ class SensorEntry(Model):
 
 
 class StatusBit(Model):
-    """A bit of the status word: its name in messages, and its effect on the samples while it is set or clear."""
+    """A bit of the status word: its name in messages, and its effect on samples while it is set or clear."""
 
     bit: Annotated[int, Key(ge=0, le=31)]
     name: Annotated[str, Key(min_length=1, max_length=64)]

@@ -18,8 +18,9 @@ MAX_MESSAGES: Final = 16
 """Kinds of message that a profile may have."""
 MAX_RANGES: Final = 4
 """Ranges of bytes that a check may cover."""
-NARROW_BITS: Final = 16
-"""A counter of fewer bits wraps within seconds: what it says about a gap depends on the time of arrival."""
+NARROW_BITS: Final = 12
+"""A counter of fewer bits, or a time of fewer samples, wraps within seconds: what it says about a gap depends
+on the time of arrival."""
 
 
 class CheckKind(IntEnum):
