@@ -173,8 +173,8 @@ class Check(Model):
                 raise ValueError(
                     f"expected whole 16-bit words, got {last - first + 1} bytes from {first} to {last}"
                 )
-            if first < self.offset + self.size and self.offset <= last:
-                raise ValueError("expected a check outside of the bytes it covers, got one inside")
+        if self.covers_value_of(self):
+            raise ValueError("expected a check outside of the bytes it covers, got one inside")
         for name, around in (("prefix", self.prefix), ("suffix", self.suffix)):
             size = len(bytes.fromhex(around or ""))
             if size > MAX_AROUND or size % self.word:
@@ -205,6 +205,10 @@ class Check(Model):
     def size(self) -> int:
         """Bytes of its value."""
         return (self.width + 7) // 8
+
+    def covers_value_of(self, other: "Check") -> bool:
+        """Whether the value of another check is among the bytes that it covers."""
+        return any(first < other.offset + other.size and other.offset <= last for first, last in self.covers)
 
 
 class Message(Model):
