@@ -74,8 +74,10 @@ def validation_faults(error: ValidationError, document: object, model: type[Mode
         elif name == "value_error":
             found[where, str(values["error"])] = []
         elif name in _EXPECTED:
-            quotes = "; put it in quotes" if name == "string_type" and isinstance(came, int | float) else ""
-            found.setdefault((where, shown_value(came) + quotes), []).append(_EXPECTED[name].format(**values))
+            hint = "; put it in quotes" if name == "string_type" and isinstance(came, int | float) else ""
+            if name == "literal_error" and isinstance(came, str):
+                hint = _nearest(came, re.findall(r"'([^']*)'", values["expected"]))
+            found.setdefault((where, shown_value(came) + hint), []).append(_EXPECTED[name].format(**values))
         else:
             found[where, f"{e['msg']}, got {shown_value(came)}"] = []
     return [
@@ -139,6 +141,12 @@ def _keys(annotation: Any, place: _Place) -> set[str]:
 def _unknown_key(name: str, known: set[str]) -> str:
     near = difflib.get_close_matches(name[:100], known, 1)
     return "unknown key; " + (f"did you mean {near[0]}?" if near else f"known are {', '.join(sorted(known))}")
+
+
+def _nearest(value: str, known: Sequence[str]) -> str:
+    """Return a hint at the known value that is like this one, if one is."""
+    near = difflib.get_close_matches(value[:100], known, 1)
+    return f"; did you mean {near[0]}?" if near else ""
 
 
 def _path(place: _Place) -> str:

@@ -45,9 +45,13 @@ def load(name_or_path: str | os.PathLike[str]) -> Profile:
 
 def load_file(name_or_path: str | os.PathLike[str]) -> SettingsFile[Profile]:
     """Read a profile together with the content of its file; see `load`."""
-    return read_file(shipped_files.find("profile", name_or_path, _FOLDER), Profile)
+    return read_file(_find(name_or_path), Profile)
 
 
 def content(name_or_path: str | os.PathLike[str]) -> bytes:
     """Return the content of a profile's file; see `load`."""
-    return shipped_files.find("profile", name_or_path, _FOLDER).read_bytes()
+    return _find(name_or_path).read_bytes()
+
+
+def _find(name_or_path: str | os.PathLike[str]) -> Path:
+    return shipped_files.find("profile", name_or_path, _FOLDER, listed_by="imudrv profiles")

@@ -8,6 +8,7 @@ from pydantic import model_validator
 from imudrv.files.model import Model
 from imudrv.records import EXTENDED
 from imudrv.wire import layout
+from imudrv.wire.check import MAX_AROUND
 
 NumberType = Literal[
     "u8", "u16", "u24", "u32", "u40", "u48", "u56", "u64",
@@ -174,8 +175,14 @@ class Check(Model):
                 raise ValueError(
                     f"expected whole 16-bit words, got {last - first + 1} bytes from {first} to {last}"
                 )
-            if first < self.offset + self.size and self.offset <= last:
-                raise ValueError("expected a check outside of the bytes it covers, got one inside")
+        if self.covers_value_of(self):
+            raise ValueError("expected a check outside of the bytes it covers, got one inside")
+        for name, around in (("prefix", self.prefix), ("suffix", self.suffix)):
+            size = len(bytes.fromhex(around or ""))
+            if size > MAX_AROUND or size % self.word:
+                raise ValueError(
+                    f"expected a {name} of at most {MAX_AROUND} bytes, whole words, got {size} bytes"
+                )
         if self.kind == "crc" and self.polynomial == 0:
             raise ValueError("expected the CRC's polynomial, got none")
         if self.kind != "crc" and (self.polynomial or self.reflected):
@@ -200,6 +207,10 @@ class Check(Model):
     def size(self) -> int:
         """Bytes of its value."""
         return (self.width + 7) // 8
+
+    def covers_value_of(self, other: "Check") -> bool:
+        """Whether the value of another check is among the bytes that it covers."""
+        return any(first < other.offset + other.size and other.offset <= last for first, last in self.covers)
 
 
 class Message(Model):
@@ -272,7 +283,9 @@ class Message(Model):
 
 
 def _require_apart(sharing: list[Number]) -> None:
-    """Refuse bits that two fields of one word have in common."""
+    """Refuse bits that two fields of one word have in common, and words of two byte orders."""
+    if len({n.byte_order for n in sharing}) > 1:
+        raise ValueError(f"expected one byte order of the fields at offset {sharing[0].offset}, got two")
     end = -1
     for n in sorted(sharing, key=lambda n: n.bits or (0, 0)):
         first, last = n.bits or (0, 8 * n.size - 1)

@@ -83,12 +83,14 @@ class Translation:
     def message(self, message: Message, *, is_can: bool) -> layout.Message:
         """Return one kind of message."""
         can_id, can_mask = message.can_id if is_can else (0, 0)
+        # The encoder computes them in turn: one that covers the values of others comes behind these.
+        checks = sorted(message.checks, key=lambda check: sum(map(check.covers_value_of, message.checks)))
         return layout.Message(
             message.length,
             tuple(self._field(n) for n in message.fields if n.only_while is None),
             tuple(self._multiplexed(n, n.only_while) for n in message.fields if n.only_while is not None),
             tuple(message.header.items()),
-            tuple(self._check(check) for check in message.checks),
+            tuple(self._check(check) for check in checks),
             can_id,
             can_mask,
             message.every,

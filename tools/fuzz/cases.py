@@ -13,6 +13,7 @@ from numpy.random import Generator
 
 from imudrv.records import MESSAGE
 
+from .any_profile import check_any_profile, make_any_profile
 from .can import check_can, make_can
 from .candump import check_candump, make_candump
 from .chain import check_chain, make_chain
@@ -45,6 +46,7 @@ TARGETS: Final = (
     Target("datagram", make_datagram, check_datagram),
     Target("yaml", make_yaml, check_yaml),
     Target("chain", make_chain, check_chain),
+    Target("profiles", make_any_profile, check_any_profile),
 )
 
 

@@ -208,7 +208,7 @@ def _finished(source: Source, k: int, fields: list[Mapping], room: int, is_can: 
             checks.append(check)
             at = check["offset"] + (check["width"] + 7) // 8
     if checks:
-        message["checks"] = checks
+        message["checks"] = pick((checks, checks[::-1]))
     message["length"] = next(n for n in CAN_LENGTHS if n >= at) if is_can else at + source.integer(0, 1)
     return message
 

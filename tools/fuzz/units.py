@@ -42,16 +42,20 @@ def random_profile(rng: Generator) -> dict[str, Any]:
     length, mask = at + int(rng.integers(3)), (1 << check["width"]) - 1
     sides = ((0, check["offset"]), (check["offset"] + check["width"] // 8, length))
     begin, end = pick(rng, [side for side in sides if side[0] < side[1]])
-    check["first"] = int(rng.integers(begin, end))
-    check["last"] = int(rng.integers(check["first"], end))
+    first = int(rng.integers(begin, end))
+    check["covers"] = [[first, int(rng.integers(first, end))]]
     check |= {name: int(rng.integers(mask + 1)) for name in ("init", "xor_out")}
-    check |= {"polynomial": int(rng.integers(mask)) + 1, "reflected": bool(rng.integers(2))}
+    if check["kind"] == "crc":
+        check |= {"polynomial": int(rng.integers(mask)) + 1, "reflected": bool(rng.integers(2))}
     check |= {"prefix": "50 26"} if rng.integers(2) else {}
     message = {"sync": sync.hex(" "), "length": length, "fields": fields, "constants": [constant]}
+    sensor = {"values": "total" if totals else "increment", "unit": "pulse"}
     return PLAIN[SERIAL[0]] | {
         "byte_order": pick(rng, ("little", "big")),
-        "counts": "total" if totals else "increment",
-        "messages": [message | ({"check": check} if rng.integers(4) else {})],
+        "gyro": sensor,
+        "accelerometer": sensor,
+        "status_bits": [],
+        "messages": [message | ({"checks": [check]} if rng.integers(4) else {})],
     }
 
 
@@ -62,8 +66,9 @@ def random_can_profile(rng: Generator) -> dict[str, Any]:
         fields = [f | {"type": counter} if f["name"] == "counter" else f for f in kind["fields"]]
         is_slow = kind.get("every", 1) > 1
         messages.append(kind | ({"every": pick(rng, (2, 5, 30))} if is_slow else {"fields": fields}))
-    order, counts = pick(rng, ("little", "big")), pick(rng, ("increment", "total"))
-    return profile | {"byte_order": order, "counts": counts, "messages": messages}
+    order = pick(rng, ("little", "big"))
+    sensor = {"values": pick(rng, ("increment", "total")), "unit": "pulse"}
+    return profile | {"byte_order": order, "gyro": sensor, "accelerometer": sensor, "messages": messages}
 
 
 def layout_of(profile: str | dict[str, Any]) -> Layout:
