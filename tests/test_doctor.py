@@ -444,6 +444,10 @@ def test_the_line_load_is_that_of_the_interface_document() -> None:
     assert diagnosis.line_load(RS422) == pytest.approx(0.477, abs=0.001)
     # two messages of 135 bits at worst and two a tenth of a second: ISO 11898-1
     assert diagnosis.line_load(CAN) == pytest.approx(2.02 * 135e-3, rel=1e-9)
+    # with identifiers of 29 bits a message of 8 bytes has up to 157 bits, and 3 idle ones
+    assert diagnosis.line_load(profiles.load("openimu-j1939")) == pytest.approx(
+        2 * 160 * 100 / 250e3, rel=1e-9
+    )
     assert 0.1 < diagnosis.line_load(CANFD) < 0.3
     slow = RS422.model_copy(update={"line": SerialLine(baudrate=115_200)})
     step = by_name(examine("/dev/no-such-port?baudrate=115200", "imu50-rs422", 0.1))["line load"]
