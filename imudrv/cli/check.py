@@ -57,9 +57,10 @@ def _line_faults(profile: Profile) -> Iterator[str]:
         key, speed, unit = "bitrate", profile.line.bitrate, "bit/s"
     else:
         key, speed, unit = "baudrate", profile.line.baudrate, "baud"
+    needed = ceil(round(load * speed, 3))
     yield (
-        f"line.{key}: expected at least {ceil(round(load * speed, 3))} {unit} for {profile.rate_hz:g} samples/s, got "
-        f"{speed}, of which they take {100 * load:.0f} %; set a faster line or a lower rate, as in the unit"
+        f"line.{key}: expected at least {needed} {unit} for {profile.rate_hz:g} samples/s, got {speed}, of "
+        f"which they take {100 * load:.0f} %; set a faster line or a lower rate, as in the unit"
     )
 
 
