@@ -27,11 +27,12 @@ from imudrv.files.settings_file import parse
 from imudrv.ports import Arrival, Port, PortEndedError
 from imudrv.ports.base import LineErrors
 from imudrv.profiles.schema import Profile, SerialLine
-from imudrv.records import MESSAGE, Reason, Source
+from imudrv.records import MESSAGE, Reason, Source, samples_type
 from imudrv.sim.capture import wire
 from imudrv.sim.live import play
 from imudrv.sim.scenario import Scenario
 from imudrv.url import split
+from imudrv.wire.encode import StreamEncoder
 
 RS422, ACC, CAN, CANFD = (
     profiles.load(name) for name in ("imu50-rs422", "imu50-rs422-acc", "imu50-can", "imu50-canfd")
@@ -437,6 +438,21 @@ def test_a_fault_of_the_unit_and_another_rate_are_reported() -> None:
     assert steps["rate"].verdict is Verdict.FAIL
     assert "expected 1000 samples/s, the unit counts 400" in steps["rate"].found
     assert "rate" not in by_name(traffic.check_traffic(RS422, summary, 0.5, False))
+
+
+def test_bits_that_mean_good_are_reported_while_they_are_clear() -> None:
+    kvh = profiles.load("kvh1775")
+    samples = np.zeros(100, samples_type(gyro_pulses=False, accelerometer_pulses=False))
+    samples["counter"] = np.arange(100)
+    samples["status"] = 0x77  # six axes valid
+
+    def bits() -> tuple[str, ...]:
+        data = StreamEncoder(kvh.layout()).encode(samples).tobytes()
+        return diagnosis.decode_traffic(kvh, data).set_bits
+
+    assert bits() == ()
+    samples["status"][50] = 0x36
+    assert bits() == ("gyro X invalid", "accelerometer Z invalid")
 
 
 def test_the_line_load_is_that_of_the_interface_document() -> None:

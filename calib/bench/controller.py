@@ -265,9 +265,9 @@ class SessionController:
 
 def _conditions(pulses: Records, layout: Layout) -> Conditions:
     """Return faults and temperatures of a sample."""
-    faults = int(pulses["status"]) & layout.status.fault
+    bits = layout.status_bits(int(pulses["status"]))
     degc = zip(layout.temperature_names, pulses["temperature_degc"].tolist(), strict=False)
     return Conditions(
-        tuple(name for bit, name in layout.status_names if faults >> bit & 1),
+        tuple(name for bit, name in bits if layout.status.fault >> bit & 1),
         {name: None if isnan(t) else t for name, t in degc},
     )

@@ -41,7 +41,7 @@ class TrafficSummary:
     messages : dict of int to int
         On CAN the number of messages for each identifier of the profile.
     set_bits : tuple of str
-        Names of the status bits that were set at any time.
+        Names of the status bits that applied at any time.
     degc : dict of str to float
         Latest temperatures; NaN if none was received.
     """
@@ -93,7 +93,8 @@ def decode_traffic(profile: Profile, data: bytes | Records) -> TrafficSummary:
         frames = np.concatenate([frames, decoder.close()])  # held until their full counter arrives
     tracker = SequenceTracker(layout)
     pulses = tracker.feed(frames)
-    status = int(np.bitwise_or.reduce(pulses["status"])) if pulses.size else 0
+    inverted = layout.status.inverted
+    status = int(np.bitwise_or.reduce(pulses["status"] ^ inverted, initial=0)) ^ inverted
     degc = pulses["temperature_degc"][-1].tolist() if pulses.size else []
     if isinstance(data, bytes):
         share = frames.size * sum(m.length for m in profile.messages if m.every == 1) / max(len(data), 1)
@@ -112,7 +113,7 @@ def decode_traffic(profile: Profile, data: bytes | Records) -> TrafficSummary:
         tracker.counts,
         rejected,
         messages,
-        tuple(name for bit, name in layout.status_names if status >> bit & 1),
+        tuple(name for _, name in layout.status_bits(status)),
         dict(zip(layout.temperature_names, degc, strict=False)),
     )
 

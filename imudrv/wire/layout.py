@@ -333,6 +333,11 @@ class Layout:
         """Change of a sample's `counter` from one to the next."""
         return int(self.sequence.step) if self.sequence.kind is SequenceKind.COUNTER else 1
 
+    def status_bits(self, word: int) -> list[tuple[int, str]]:
+        """Return bit and name of the status bits that apply: those set, or clear if that is their meaning."""
+        applies = word ^ self.status.inverted
+        return [(bit, name) for bit, name in self.status_names if applies >> bit & 1]
+
     @property
     def sensors(self) -> tuple[Sensor, Sensor]:
         """Gyros and accelerometers."""
