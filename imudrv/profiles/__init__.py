@@ -1,7 +1,12 @@
 """Profiles: wire formats of units as data. Some come with the package; a user's own is read by its path.
 
-schema  the profile file, checked completely, and its translation into the decoder's `Layout`
-dbc     skeleton of a profile from a DBC file
+schema       the profile file, checked completely
+messages     its messages: numbers and checks
+translation  to the decoder's `Layout`
+advice       what to write instead of what a profile cannot say
+summary      what a profile says, in a few lines
+dbc          skeleton of a profile from a DBC file
+version_1    profiles of version 1 in the words of version 2
 """
 
 import os
@@ -15,6 +20,7 @@ from imudrv.profiles.schema import Profile
 OWN: Final = ("imu50-rs422", "imu50-rs422-acc", "imu50-can", "imu50-canfd")
 """Shipped profiles of the 50-type unit; the others are of units of other makers."""
 _FOLDER: Final = Path(__file__).parent
+_LISTED: Final = f"{', '.join(OWN)}, another one of `imudrv profiles`"
 
 
 def shipped() -> list[str]:
@@ -45,9 +51,13 @@ def load(name_or_path: str | os.PathLike[str]) -> Profile:
 
 def load_file(name_or_path: str | os.PathLike[str]) -> SettingsFile[Profile]:
     """Read a profile together with the content of its file; see `load`."""
-    return read_file(shipped_files.find("profile", name_or_path, _FOLDER), Profile)
+    return read_file(_find(name_or_path), Profile)
 
 
 def content(name_or_path: str | os.PathLike[str]) -> bytes:
     """Return the content of a profile's file; see `load`."""
-    return shipped_files.find("profile", name_or_path, _FOLDER).read_bytes()
+    return _find(name_or_path).read_bytes()
+
+
+def _find(name_or_path: str | os.PathLike[str]) -> Path:
+    return shipped_files.find("profile", name_or_path, _FOLDER, _LISTED)

@@ -226,7 +226,9 @@ class Profile(Model):
 
     def _tick_faults(self) -> Iterator[str]:
         """Yield what keeps a time in whole ticks from numbering the samples."""
-        times = [n for m in self.messages if m.is_part for n in m.fields if n.name == "time" and not n.is_float]
+        times = [
+            n for m in self.messages if m.is_part for n in m.fields if n.name == "time" and not n.is_float
+        ]
         for n in times[:1]:
             ticks = Fraction(TICKS_PER_S[n.unit or "s"]) / self.rate
             # From one sample to the next a time advances by the whole ticks below or above: with less than
