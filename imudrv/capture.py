@@ -12,7 +12,7 @@ import numpy as np
 from imudrv import profiles
 from imudrv.calibration import Calibration, coefficients, read_calibration
 from imudrv.capture_files import CaptureFile, DamageSigns
-from imudrv.diagnosis import find_mismatch, fitting_profiles, sequence_fault, unknown_gaps
+from imudrv.diagnosis import find_mismatch, fitting_profiles, sequence_fault
 from imudrv.errors import InputError
 from imudrv.imu.clock import ClockModel
 from imudrv.imu.compensation import Compensator
@@ -137,8 +137,6 @@ class Capture:
                 f"{errors.runs} error frames beside {messages} messages: the bus is faulty; "
                 "check its wiring, termination and bit rate"
             )
-        if gaps := unknown_gaps(counts, self.layout.sequence):
-            hints.append(gaps)
         return hints
 
     @property

@@ -216,5 +216,5 @@ def test_a_shipped_profile_is_of_its_name_and_says_where_it_is_from(name: str) -
 
 
 def test_an_unknown_profile_names_the_shipped_ones() -> None:
-    with pytest.raises(InputError, match=r"imu50-rs422-acc.*imudrv profiles"):
+    with pytest.raises(InputError, match=r"imu50-rs422-acc.* or the path of a profile file"):
         profiles.load("imu51")

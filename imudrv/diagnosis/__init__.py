@@ -2,13 +2,13 @@
 
 traffic    data decoded with a profile
 mismatch   why data holds no frame of a profile, and which profile fits
-sequence   gaps of unknown length, and why most good frames are not in sequence
+sequence   why most good frames are not in sequence
 line       state of an open line, watched arrival by arrival
 """
 
 from imudrv.diagnosis.line import LineState, LineWatch
 from imudrv.diagnosis.mismatch import Mismatch, best_profile, find_mismatch, fitting_profiles
-from imudrv.diagnosis.sequence import sequence_fault, unknown_gaps
+from imudrv.diagnosis.sequence import sequence_fault
 from imudrv.diagnosis.traffic import RATE_TOLERANCE, TrafficSummary, decode_traffic, explain, line_load, rate
 
 __all__ = [
@@ -25,5 +25,4 @@ __all__ = [
     "line_load",
     "rate",
     "sequence_fault",
-    "unknown_gaps",
 ]

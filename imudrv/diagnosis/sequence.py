@@ -1,4 +1,4 @@
-"""Gaps whose length is not known, and good frames that are not in sequence, as a wrong counter makes them."""
+"""Good frames that are not in sequence, as a profile with a wrong counter makes them."""
 
 from typing import Final
 
@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imudrv.imu.sequence import SampleCounts
-from imudrv.wire.layout import Sequence, SequenceKind
 
 _LEAST_FRAMES: Final = 10
 
@@ -44,30 +43,4 @@ def sequence_fault(counts: SampleCounts, gaps: int, counters: NDArray[np.int64])
     return (
         f"{found}; it advances by {step} from frame to frame: "
         f"if that is one sample, set `step: {step}` of the counter in the profile"
-    )
-
-
-def unknown_gaps(counts: SampleCounts, sequence: Sequence) -> str:
-    """Say how much longer the gaps of unknown length may be than they are counted.
-
-    Parameters
-    ----------
-    counts : SampleCounts
-        Counts of all frames.
-    sequence : Sequence
-        What numbers the samples.
-
-    Returns
-    -------
-    str
-        Empty if all lengths are known.
-    """
-    if not counts.unknown_gaps:
-        return ""
-    gaps = f"{counts.unknown_gaps} gap{'s' if counts.unknown_gaps > 1 else ''} of unknown length"
-    if sequence.kind is SequenceKind.NONE:
-        return f"{gaps}: the unit does not number its samples, and there are no times of arrival"
-    span = round(2**sequence.bits / sequence.step)
-    return (
-        f"{gaps}, counted with the smallest: or {span} more, any number of times; times of arrival would tell"
     )

@@ -93,8 +93,9 @@ def decode_traffic(profile: Profile, data: bytes | Records) -> TrafficSummary:
         frames = np.concatenate([frames, decoder.close()])  # held until their full counter arrives
     tracker = SequenceTracker(layout)
     pulses = tracker.feed(frames)
-    inverted = layout.status.inverted
-    status = int(np.bitwise_or.reduce(pulses["status"] ^ inverted, initial=0)) ^ inverted
+    active: dict[int, str] = {}
+    for status in np.unique(pulses["status"]).tolist():
+        active |= layout.active_bits(status)
     degc = pulses["temperature_degc"][-1].tolist() if pulses.size else []
     if isinstance(data, bytes):
         share = frames.size * sum(m.length for m in profile.messages if m.every == 1) / max(len(data), 1)
@@ -113,7 +114,7 @@ def decode_traffic(profile: Profile, data: bytes | Records) -> TrafficSummary:
         tracker.counts,
         rejected,
         messages,
-        tuple(name for _, name in layout.status_bits(status)),
+        tuple(active[mask] for mask in sorted(active)),
         dict(zip(layout.temperature_names, degc, strict=False)),
     )
 
@@ -133,7 +134,7 @@ def line_load(profile: Profile) -> float:
     """
     line, rate = profile.line, profile.rate_hz
     if isinstance(line, SerialLine):
-        return profile.transmission_ns * NS * rate
+        return profile.transmission_ns * NS * rate  # how often other messages come is not known
     if line.data_bitrate is not None:
         return _STUFFING * (profile.transmission_ns * NS + _IDLE_BITS / line.bitrate) * rate
     return sum(_most_bits(m) / m.every for m in profile.messages) * rate / line.bitrate

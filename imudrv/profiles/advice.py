@@ -111,7 +111,6 @@ _VALUES: Final = (
     (r"unit", r"min.*|h.*|day.*|week.*", "the time must be finer than a sample; leave this field out"),
     (r"per_count", r"-.*", "for an axis that is counted the other way write sign: -1 in its field"),
     (r"per_count", r".*[/^*].*|\[.*", "write the number: 1.52587890625e-05 for 1/65536"),
-    (r"degc_per_count", r"-.*", "a temperature that falls with its number cannot be described: leave it out"),
     (r"sensor", r".*", "write electronics for any other"),
     (r"bits", r"\d+", "write the first and the last bit, as in [7, 7]"),
     (

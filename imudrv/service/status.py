@@ -90,9 +90,8 @@ class UnitStatus:
     @classmethod
     def of(cls, word: int, layout: Layout) -> Self:
         """Name the bits of a status word."""
-        bits = layout.status_bits(word)
-        faults = [name for bit, name in bits if layout.status.fault >> bit & 1]
-        return cls(word, [name for _, name in bits], faults)
+        bits = layout.active_bits(word)
+        return cls(word, list(bits.values()), [n for mask, n in bits.items() if mask & layout.status.fault])
 
 
 @dataclass(frozen=True)
