@@ -381,6 +381,15 @@ def test_any_value_has_a_short_message(path: str, value: object) -> None:
         assert fault.isprintable()
 
 
+@pytest.mark.parametrize("key", [".a" * 100_000, "x" * 100_000, "", "\x1b[0m", "length.scale"])
+def test_any_unknown_key_has_a_short_message(key: str) -> None:
+    with pytest.raises(FaultyFileError) as caught:
+        parse(PROFILE | {key: 1}, Profile, "unit.yaml")
+    (fault,) = caught.value.faults
+    assert len(fault) < 400
+    assert fault.isprintable()
+
+
 @pytest.mark.parametrize(
     ("rate_hz", "type", "unit", "words"),
     [

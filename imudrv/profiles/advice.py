@@ -4,7 +4,7 @@ import re
 from typing import Final
 
 _LONGEST: Final = 80
-"""Characters of a value that are looked at."""
+"""Characters of a path or a value that are looked at."""
 _NO_TEXT: Final = "only binary messages can be described: set the unit to one, not to text such as NMEA"
 _NO_STUFFING: Final = (
     "stuffed bytes (SLIP, COBS, DLE) cannot be described: set the unit to another format, or remove the "
@@ -198,4 +198,4 @@ def for_value(path: str, value: object) -> str:
 
 
 def _ends_with(path: str, keys: str) -> bool:
-    return re.fullmatch(rf"(.*\.)?({keys})", path, re.DOTALL) is not None
+    return re.fullmatch(rf"(.*\.)?({keys})", path[-_LONGEST:], re.DOTALL) is not None

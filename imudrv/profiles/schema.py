@@ -255,9 +255,9 @@ class Profile(Model):
             # Rounded times differ by up to a tick more or less, which must not be half a sample.
             if ticks < 2 and ticks != 1:
                 yield (
-                    f"time.unit: expected a unit of which a sample takes 2 or more (or 1), got {float(ticks):g} "
-                    f"{n.unit} at {self.rate_hz:g} samples/s; leave the field out, and samples are numbered "
-                    "as they arrive"
+                    "time.unit: expected a unit of which a sample takes 2 or more (or 1), got "
+                    f"{float(ticks):g} {n.unit} at {self.rate_hz:g} samples/s; leave the field out, and "
+                    "samples are numbered as they arrive"
                 )
             if 2 * ticks > 1 << n.width:
                 yield (
