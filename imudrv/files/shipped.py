@@ -12,7 +12,7 @@ def names(folder: Path) -> list[str]:
     return sorted(path.stem for path in folder.glob("*.yaml"))
 
 
-def find(kind: str, name_or_path: str | os.PathLike[str], folder: Path, listed: str = "") -> Path:
+def find(kind: str, name_or_path: str | os.PathLike[str], folder: Path) -> Path:
     """Return the path of a file.
 
     Parameters
@@ -23,8 +23,6 @@ def find(kind: str, name_or_path: str | os.PathLike[str], folder: Path, listed: 
         Name of a file in the folder, or path of any file.
     folder : Path
         Folder of the package.
-    listed : str
-        Names in the message, where all are too many.
 
     Returns
     -------
@@ -43,7 +41,7 @@ def find(kind: str, name_or_path: str | os.PathLike[str], folder: Path, listed: 
         near = difflib.get_close_matches(name, known, 1)
         hint = f"; did you mean {near[0]}?" if near else ""
         raise InputError(
-            f"{kind} {name!r}: expected one of {listed or ', '.join(known)}, "
+            f"{kind} {name!r}: expected one of {', '.join(known)}, "
             f"or the path of a {kind} file; there is no such file{hint}"
         )
     return Path(name)

@@ -20,7 +20,6 @@ from imudrv.profiles.schema import Profile
 OWN: Final = ("imu50-rs422", "imu50-rs422-acc", "imu50-can", "imu50-canfd")
 """Shipped profiles of the 50-type unit; the others are of units of other makers."""
 _FOLDER: Final = Path(__file__).parent
-_LISTED: Final = f"{', '.join(OWN)}, another one of `imudrv profiles`"
 
 
 def shipped() -> list[str]:
@@ -51,13 +50,9 @@ def load(name_or_path: str | os.PathLike[str]) -> Profile:
 
 def load_file(name_or_path: str | os.PathLike[str]) -> SettingsFile[Profile]:
     """Read a profile together with the content of its file; see `load`."""
-    return read_file(_find(name_or_path), Profile)
+    return read_file(shipped_files.find("profile", name_or_path, _FOLDER), Profile)
 
 
 def content(name_or_path: str | os.PathLike[str]) -> bytes:
     """Return the content of a profile's file; see `load`."""
-    return _find(name_or_path).read_bytes()
-
-
-def _find(name_or_path: str | os.PathLike[str]) -> Path:
-    return shipped_files.find("profile", name_or_path, _FOLDER, _LISTED)
+    return shipped_files.find("profile", name_or_path, _FOLDER).read_bytes()
