@@ -21,7 +21,7 @@ from imudrv.units import ARCSEC, DEG_PER_H, MM, PPM, UG
 NORM_TOLERANCE: Final = 0.1
 """Largest deviation from 1 of the length of a row or column of an axes matrix."""
 MIN_DETERMINANT: Final = 0.5
-"""Smallest magnitude of an axes matrix's determinant: axes may be exchanged or reversed, but not parallel."""
+"""Smallest determinant of an axes matrix: axes may be turned, but neither mirrored nor parallel."""
 GAUGE_TOLERANCE_MM: Final = 1e-5
 """Largest deviation from the stated gauge: ten times the rounding to six decimals."""
 COVARIANCE_TOLERANCE_MM2: Final = 5e-6
@@ -46,7 +46,12 @@ def _axes(matrix: Matrix3) -> Matrix3:
     determinant = np.linalg.det(C)
     if abs(determinant) < MIN_DETERMINANT:
         raise ValueError(
-            f"expected three independent axes, |determinant| >= {MIN_DETERMINANT:g}, got {determinant:.3g}"
+            f"expected three independent axes, determinant >= {MIN_DETERMINANT:g}, got {determinant:.3g}"
+        )
+    if determinant < 0.0:
+        raise ValueError(
+            f"expected right-handed axes, determinant > 0, got {determinant:.3g}: a mirror image; for a "
+            "reversed sensor set sign: -1 in the profile, for two exchanged ones exchange their axis there"
         )
     return matrix
 

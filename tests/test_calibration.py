@@ -225,9 +225,26 @@ def test_a_fault_names_its_place(path: str, value: Any, words: str) -> None:
     assert caught.value.faults[0].startswith(words)
 
 
-def test_axes_exchanged_or_reversed_are_another_laboratory_s_not_a_fault() -> None:
-    swapped = [[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
-    assert coefficients(calibration(changed("accelerometer.C_ba", swapped))).C_ba.tolist() == swapped
+def test_axes_exchanged_in_a_circle_are_another_laboratory_s_not_a_fault() -> None:
+    turned = [[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]]
+    assert coefficients(calibration(changed("accelerometer.C_ba", turned))).C_ba.tolist() == turned
+
+
+@pytest.mark.parametrize("place", ["gyro.C_bg", "accelerometer.C_ba"])
+@pytest.mark.parametrize(
+    "mirror",
+    [
+        [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]],
+        [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]],
+        [[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]],
+    ],
+)
+def test_a_mirror_matrix_is_a_fault_that_belongs_into_the_profile(
+    place: str, mirror: list[list[float]]
+) -> None:
+    words = fault(changed(place, mirror))
+    assert words.startswith(f"{place}: expected right-handed axes, determinant > 0, got -1: a mirror image")
+    assert "sign: -1" in words
 
 
 def test_axes_nearly_parallel_are_a_fault() -> None:
@@ -237,7 +254,7 @@ def test_axes_nearly_parallel_are_a_fault() -> None:
     # Rows of length 1, 30 degrees from square: the columns are sqrt(1.25) and sqrt(0.75) long.
     oblique = [[1.0, 0.0, 0.0], [0.5, math.sqrt(0.75), 0.0], [0.0, 0.0, 1.0]]
     assert "of a length within 0.1 of 1, got one of 0.866;" in fault(changed("gyro.C_bg", oblique))
-    assert "expected three independent axes, |determinant| >= 0.5, got 0.342" in fault(
+    assert "expected three independent axes, determinant >= 0.5, got 0.342" in fault(
         changed("gyro.C_bg", parallel)
     )
 

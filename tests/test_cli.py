@@ -215,6 +215,75 @@ def test_check_knows_every_kind_of_file(bench: Path) -> None:
         assert f"imu50-{kind}" in done.stdout
 
 
+def test_check_says_what_it_understood_of_a_profile(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shipped = ROOT / "imudrv" / "profiles"
+    expected = {
+        "kvh1775": [
+            "line:          serial, 921600 baud 8N1, 39.1 % of it used",  # 360 bits a sample
+            "samples:       1000 per second",
+            "message:       sync FE 81 FF 55, 36 bytes, crc of 32 bits",
+            "gyro:          increments in rad: x y z f32",
+            "temperature:   gyro",
+            "status:        8 bits, 6 of them with a meaning",
+            "sequence:      counter of 7 bits, 1 a sample, begins anew every 128 ms",
+        ],
+        # 1 count is 200 / 2^15 and 200 / 2^31 deg/s; 65536 samples of 5 ms
+        "tamagawa-fog-serial": [
+            "gyro:          rates in deg/s: x y i16 up to 199.994 deg/s, z i32 up to 200 deg/s",
+            "sequence:      counter of 16 bits, 1 a sample, begins anew every 5.46 min",
+        ],
+        "stim300-91-totals": ["gyro:          running totals in deg: x y z u24"],
+        "novatel-rawimusx": ["x -y z i32", "sequence:      floating-point time in s"],
+        "hg4930": [
+            "sync 0E 01, 20 bytes, sum of 16 bits, skipped",
+            "none: samples are numbered as they arrive",
+        ],
+        "hipnuc": ["sequence:      time of 32 bits in ms, 2.5 a sample, begins anew every 49.7 days"],
+        "imu50-can": ["id 152, 8 bytes, no check, one in 100 samples", "increments in pulses: x y z i16"],
+        "openimu-j1939": ["can, 250000 bit/s, 12.8 % of it used", "pgn F02A, 8 bytes"],  # 320 bits in 10 ms
+        "exail-asterix": ["accelerometer: none"],
+    }
+    for name, lines in expected.items():
+        assert main(["check", str(shipped / f"{name}.yaml")]) == 0
+        printed = capsys.readouterr().out
+        assert all(line in printed for line in lines), printed
+
+
+@pytest.mark.parametrize(
+    ("name", "line", "slow", "words"),
+    [
+        # 44 bytes of 10 bits, 1000 times a second
+        (
+            "imu50-rs422",
+            "baudrate: 921600",
+            "baudrate: 115200",
+            "line.baudrate: expected at least 440000 baud for 1000 samples/s, got 115200, of which "
+            "they take 382 %",
+        ),
+        # 273 bits at worst, 1000 times a second
+        ("imu50-can", "bitrate: 1000000", "bitrate: 250000", "line.bitrate: expected at least 272700 bit/s"),
+    ],
+)
+def test_check_refuses_a_line_too_slow_for_the_samples(
+    name: str, line: str, slow: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (ROOT / "imudrv" / "profiles" / f"{name}.yaml").read_text()
+    assert line in text
+    (tmp_path / "unit.yaml").write_text(text.replace(line, slow))
+    assert main(["check", str(tmp_path / "unit.yaml")]) == 2
+    errors = capsys.readouterr().err
+    assert words in errors
+    assert "set a faster line or a lower rate" in errors
+
+
+def test_check_refuses_a_mirror_matrix(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "unit.yaml").write_text(
+        CERTIFICATE.replace("C_bg: [[1, 0, 0], [0, 1, 0]", "C_bg: [[0, 1, 0], [1, 0, 0]")
+    )
+    assert main(["check", str(tmp_path / "unit.yaml")]) == 2
+    assert "gyro.C_bg: expected right-handed axes, determinant > 0, got -1" in capsys.readouterr().err
+
+
 def test_ctrl_c_leaves_no_half_file(bench: Path) -> None:
     (bench / "long.yaml").write_text(SCENARIO.replace("duration_s: 1.0}", "duration_s: 30000.0}", 1))
     process = subprocess.Popen(

@@ -27,11 +27,12 @@ from imudrv.files.settings_file import parse
 from imudrv.ports import Arrival, Port, PortEndedError
 from imudrv.ports.base import LineErrors
 from imudrv.profiles.schema import Profile, SerialLine
-from imudrv.records import MESSAGE, Reason, Source
+from imudrv.records import MESSAGE, Reason, Source, samples_type
 from imudrv.sim.capture import wire
 from imudrv.sim.live import play
 from imudrv.sim.scenario import Scenario
 from imudrv.url import split
+from imudrv.wire.encode import StreamEncoder
 
 RS422, ACC, CAN, CANFD = (
     profiles.load(name) for name in ("imu50-rs422", "imu50-rs422-acc", "imu50-can", "imu50-canfd")
@@ -439,11 +440,30 @@ def test_a_fault_of_the_unit_and_another_rate_are_reported() -> None:
     assert "rate" not in by_name(traffic.check_traffic(RS422, summary, 0.5, False))
 
 
+def test_bits_that_mean_good_are_reported_while_they_are_clear() -> None:
+    kvh = profiles.load("kvh1775")
+    samples = np.zeros(100, samples_type(gyro_pulses=False, accelerometer_pulses=False))
+    samples["counter"] = np.arange(100)
+    samples["status"] = 0x77  # six axes valid
+
+    def bits() -> tuple[str, ...]:
+        data = StreamEncoder(kvh.layout()).encode(samples).tobytes()
+        return diagnosis.decode_traffic(kvh, data).set_bits
+
+    assert bits() == ()
+    samples["status"][50] = 0x36
+    assert bits() == ("gyro X invalid", "accelerometer Z invalid")
+
+
 def test_the_line_load_is_that_of_the_interface_document() -> None:
     # 44 bytes of 10 bits a millisecond (ICD, section 2)
     assert diagnosis.line_load(RS422) == pytest.approx(0.477, abs=0.001)
     # two messages of 135 bits at worst and two a tenth of a second: ISO 11898-1
     assert diagnosis.line_load(CAN) == pytest.approx(2.02 * 135e-3, rel=1e-9)
+    # with identifiers of 29 bits a message of 8 bytes has up to 157 bits, and 3 idle ones
+    assert diagnosis.line_load(profiles.load("openimu-j1939")) == pytest.approx(
+        2 * 160 * 100 / 250e3, rel=1e-9
+    )
     assert 0.1 < diagnosis.line_load(CANFD) < 0.3
     slow = RS422.model_copy(update={"line": SerialLine(baudrate=115_200)})
     step = by_name(examine("/dev/no-such-port?baudrate=115200", "imu50-rs422", 0.1))["line load"]
@@ -465,7 +485,7 @@ def test_limits_that_are_too_low_are_reported_with_their_fix(monkeypatch: pytest
 
 
 def test_a_wrong_url_or_profile_is_refused() -> None:
-    with pytest.raises(InputError, match="expected one of imu50-can"):
+    with pytest.raises(InputError, match="expected one of .*imu50-can"):
         list(examine("/dev/ttyUSB0", "imu51", 0.1))
     with pytest.raises(InputError):
         list(examine("nonsense", None, 0.1))

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,13 +24,14 @@ def stream_profile(**changes: object) -> dict[str, object]:
     """A small serial profile of another laboratory, to be changed."""
     document: dict[str, object] = {
         "format": "imu50-profile",
-        "version": 1,
+        "version": 2,
         "name": "another",
         "transport": "serial",
         "line": {"baudrate": 230400, "parity": "even"},
         "sample_rate_hz": 400,
         "byte_order": "big",
-        "counts": "increment",
+        "gyro": {"values": "increment", "unit": "pulse"},
+        "accelerometer": {"values": "increment", "unit": "pulse"},
         "nominal": {"gyro_arcsec_per_pulse": 1.0, "accelerometer_pulse_per_m_s": 1000.0},
         "messages": [message(3, "i24", "u8", {"kind": "sum", "width": 16})],
     }
@@ -52,7 +54,7 @@ def message(sync_bytes: int, pulse: str, counter: str, check: dict[str, object] 
     made: dict[str, object] = {"sync": "AA 55 0D"[: 3 * sync_bytes - 1], "fields": fields}
     if check:
         size = int(str(check["width"])) // 8
-        made["check"] = {"first": 0, "last": at - 1, "offset": at, **check}
+        made["checks"] = [{"covers": [[0, at - 1]], "offset": at, **check}]
         at += size
     return made | {"length": at}
 
@@ -79,7 +81,10 @@ INVENTED = {
         ],
     ),
     "2 kHz, totals of 32 bits, 24-bit counter, 8-bit sum": stream_profile(
-        sample_rate_hz=2000, counts="total", messages=[message(2, "u32", "u24", {"kind": "sum", "width": 8})]
+        sample_rate_hz=2000,
+        gyro={"values": "total", "unit": "pulse"},
+        accelerometer={"values": "total", "unit": "pulse"},
+        messages=[message(2, "u32", "u24", {"kind": "sum", "width": 8})],
     ),
     "100 Hz, 8-bit pulses, 32-bit counter, no check": stream_profile(
         sample_rate_hz=100, messages=[message(3, "i8", "u32", None)]
@@ -150,6 +155,22 @@ def test_an_invented_profile_works_by_path_without_code(document: dict[str, obje
     assert tracker.counts.closes
 
 
+@pytest.mark.parametrize("document", INVENTED.values(), ids=INVENTED.keys())
+def test_a_profile_of_version_1_means_the_same(document: dict[str, Any], tmp_path: Path) -> None:
+    one = {key: value for key, value in document.items() if key not in ("gyro", "accelerometer")}
+    one |= {"version": 1, "counts": document["gyro"]["values"], "messages": []}
+    for message in document["messages"]:
+        parts = {key: value for key, value in message.items() if key != "checks"}
+        for check in message.get("checks", []):
+            ((first, last),) = check["covers"]
+            parts["check"] = {k: v for k, v in check.items() if k != "covers"} | {
+                "first": first,
+                "last": last,
+            }
+        one["messages"].append(parts)
+    assert profiles.load(written(tmp_path, one)) == profiles.load(written(tmp_path, document))
+
+
 def test_all_faults_of_a_profile_are_reported_at_once(tmp_path: Path) -> None:
     document = stream_profile(byte_order="middle", sample_rate_hz=0, colour="red")
     with pytest.raises(FaultyFileError) as caught:
@@ -171,7 +192,7 @@ def test_all_faults_of_a_profile_are_reported_at_once(tmp_path: Path) -> None:
         (
             {
                 "messages": [
-                    message(3, "i24", "u8", {"kind": "sum", "width": 8, "offset": 5, "first": 0, "last": 9})
+                    message(3, "i24", "u8", {"kind": "sum", "width": 8, "offset": 5, "covers": [[0, 9]]})
                 ]
             },
             "inside",

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from imudrv import Capture
 from imudrv.cli import main
 from imudrv.profiles import load
-from imudrv.records import PULSES
+from imudrv.records import PULSES, samples_type
 from imudrv.wire.encode import StreamEncoder
 
 COUNT = 400
@@ -88,3 +88,43 @@ def test_a_capture_without_frames_says_what_was_seen_and_which_profile_fits(
     )
     assert main(["decode", str(capture), "--profile", "imu50-can", "-o", out]) == 2
     assert "its beginning has frames of imu50-rs422: try --profile imu50-rs422" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("profile", "holes", "hint"),
+    [
+        (
+            "kvh1775",
+            [100],
+            "1 gaps of unknown length, counted with the smallest: each may be 128 longer",
+        ),
+        (
+            "kvh1775",
+            [100, 300],
+            "2 gaps of unknown length, counted with the smallest: each may be 128 longer",
+        ),
+        ("hg4930", [100], "1 gaps of unknown length, counted with the smallest: each may be 1 longer"),
+        ("kvh1775", [], ""),
+        ("imu50-rs422", [100], ""),
+    ],
+)
+def test_the_summary_says_how_much_longer_a_gap_of_unknown_length_may_be(
+    profile: str, holes: list[int], hint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    layout = load(profile).layout()
+    gyro, accelerometer = layout.sensors
+    samples = np.zeros(
+        COUNT, samples_type(gyro_pulses=gyro.in_pulses, accelerometer_pulses=accelerometer.in_pulses)
+    )
+    samples["counter"] = np.arange(COUNT)
+    samples["interval_ns"] = layout.interval_ns
+    data = StreamEncoder(layout).encode(samples)
+    length = len(data.tobytes()) // COUNT
+    frames = [data.tobytes()[k * length : (k + 1) * length] for k in range(COUNT)]
+    for hole in holes:
+        frames[hole] = frames[hole][: length // 2]
+    capture = tmp_path / "unit.raw"
+    capture.write_bytes(b"".join(frames))
+    assert main(["decode", str(capture), "--profile", profile, "-o", str(tmp_path / "out.npz")]) == 0
+    printed = capsys.readouterr().out
+    assert hint in printed if hint else "unknown length" not in printed

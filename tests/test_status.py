@@ -17,7 +17,7 @@ from imudrv.profiles import load
 from imudrv.records import PULSES
 from imudrv.service.loop import POLL_NS, Service
 from imudrv.service.settings import Settings
-from imudrv.service.status import Status
+from imudrv.service.status import Status, UnitStatus
 from imudrv.service.status_socket import StatusServer, ask
 from imudrv.sim.scenario import NOMINAL
 from imudrv.units import NS_PER_S
@@ -120,3 +120,22 @@ def test_the_exit_code_of_the_health_survives_a_reader_that_has_gone(
     server.close()
     _, errors = process.communicate()
     assert (process.returncode, errors) == (4, b"")
+
+
+@pytest.mark.parametrize(
+    ("profile", "word", "bits", "faults"),
+    [
+        ("imu50-rs422", 0b11, ["warm-up", "gyro X fault"], ["gyro X fault"]),
+        ("kvh1775", 0x77, [], []),
+        (
+            "kvh1775",
+            0x36,
+            ["gyro X invalid", "accelerometer Z invalid"],
+            ["gyro X invalid", "accelerometer Z invalid"],
+        ),
+    ],
+)
+def test_a_bit_that_means_good_is_a_fault_while_it_is_clear(
+    profile: str, word: int, bits: list[str], faults: list[str]
+) -> None:
+    assert UnitStatus.of(word, load(profile).layout()) == UnitStatus(word, bits, faults)

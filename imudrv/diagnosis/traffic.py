@@ -6,6 +6,7 @@ from typing import Final
 import numpy as np
 
 from imudrv.imu.sequence import SampleCounts, SequenceTracker
+from imudrv.profiles.messages import Message
 from imudrv.profiles.schema import Profile, SerialLine
 from imudrv.records import EXTENDED, Reason, Records
 from imudrv.units import NS
@@ -40,7 +41,7 @@ class TrafficSummary:
     messages : dict of int to int
         On CAN the number of messages for each identifier of the profile.
     set_bits : tuple of str
-        Names of the status bits that were set at any time.
+        Names of the status bits that applied at any time.
     degc : dict of str to float
         Latest temperatures; NaN if none was received.
     """
@@ -133,14 +134,19 @@ def line_load(profile: Profile) -> float:
     """
     line, rate = profile.line, profile.rate_hz
     if isinstance(line, SerialLine):
-        others = sum(m.length for m in profile.messages if not m.is_part)  # at least one each a sample
-        return (profile.transmission_ns * NS + others * line.bits_a_byte / line.baudrate) * rate
+        return profile.transmission_ns * NS * rate  # how often other messages come is not known
     if line.data_bitrate is not None:
         return _STUFFING * (profile.transmission_ns * NS + _IDLE_BITS / line.bitrate) * rate
-    # ISO 11898-1: a bit is stuffed after five equal ones, in 34 bits of overhead and in the data
-    bits = (8 * m.length + 44 + _IDLE_BITS + (34 + 8 * m.length - 1) // 4 for m in profile.messages)
-    shares = (b / m.every for b, m in zip(bits, profile.messages, strict=True))
-    return sum(shares) * rate / line.bitrate
+    return sum(_most_bits(m) / m.every for m in profile.messages) * rate / line.bitrate
+
+
+def _most_bits(message: Message) -> int:
+    """Return the bits of a classic CAN message with the idle ones that follow, if most bits are stuffed.
+
+    A bit is stuffed after five equal ones, in the data and in the fields before and after (ISO 11898-1).
+    """
+    around, stuffed = (64, 54) if message.can_id[0] & EXTENDED else (44, 34)
+    return 8 * message.length + around + _IDLE_BITS + (stuffed + 8 * message.length - 1) // 4
 
 
 def explain(profile: Profile, traffic: TrafficSummary, seconds: float) -> str:

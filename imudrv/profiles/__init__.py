@@ -1,7 +1,12 @@
 """Profiles: wire formats of units as data. Some come with the package; a user's own is read by its path.
 
-schema  the profile file, checked completely, and its translation into the decoder's `Layout`
-dbc     skeleton of a profile from a DBC file
+schema       the profile file, checked completely
+messages     its messages: numbers and checks
+translation  to the decoder's `Layout`
+advice       what to write instead of what a profile cannot say
+summary      what a profile says, in a few lines
+dbc          skeleton of a profile from a DBC file
+version_1    profiles of version 1 in the words of version 2
 """
 
 import os

@@ -1,9 +1,10 @@
 """Messages of a profile: their numbers and checks."""
 
+import re
 from typing import Annotated, Final, Literal, Self
 
+from pydantic import AfterValidator, model_validator
 from pydantic import Field as Key
-from pydantic import model_validator
 
 from imudrv.files.model import Model
 from imudrv.records import EXTENDED
@@ -15,9 +16,19 @@ NumberType = Literal[
     "i8", "i16", "i24", "i32", "i40", "i48", "i56", "i64",
     "f32", "f64",
 ]  # fmt: skip
+
+
+def _hex(text: str) -> str:
+    if not re.fullmatch(r"[ \t]*([0-9A-Fa-f]{2}[ \t]*)+", text):
+        raise ValueError(
+            f"expected bytes in hexadecimal, two digits each, as in EB 90, got text {text[:60]!r}"
+        )
+    return text
+
+
 Offset = Annotated[int, Key(ge=0, le=4095)]
 Byte = Annotated[int, Key(ge=0, le=255)]
-Hex = Annotated[str, Key(pattern=r"^[ \t]*([0-9A-Fa-f]{2}[ \t]*)+$", max_length=96)]
+Hex = Annotated[str, Key(max_length=96), AfterValidator(_hex)]
 Order = Literal["little", "big"]
 Word32 = Annotated[int, Key(ge=0, le=0xFFFFFFFF)]
 PerCount = Annotated[float, Key(gt=0, le=1e9)]
@@ -87,9 +98,14 @@ class Number(Model):
         if self.step is not None and self.name not in ("counter", "time"):
             raise ValueError("expected 'step' with counter or time only")
         if self.per_count is not None and not of_axis:
-            raise ValueError("expected 'per_count' with gyro and accelerometer only")
+            raise ValueError(
+                "expected 'per_count' with gyro and accelerometer only; a temperature has 'degc_per_count'"
+            )
         if (self.zero or self.sign < 0) and not of_axis:
-            raise ValueError("expected 'zero' and 'sign' with gyro and accelerometer only")
+            raise ValueError(
+                "expected 'zero' and 'sign' with gyro and accelerometer only; of a temperature at number 0 "
+                "give 'degc_at_zero'"
+            )
         if self.only_while is not None and self.name not in ("temperature", "status"):
             raise ValueError(
                 "expected 'only_while' with temperature and status only; a sensor's numbers that take turns "
@@ -102,9 +118,12 @@ class Number(Model):
         if self.name in ("counter", "time", "status") and self.type[0] == "i":
             raise ValueError(f"expected an unsigned type for {self.name}, got {self.type}")
         if self.name == "counter" and self.step is not None and self.step != int(self.step):
-            raise ValueError(f"expected a whole number as the step of a counter, got {self.step:g}")
+            raise ValueError(
+                f"expected a whole number as the step of a counter, got {self.step:g}; a number that is the "
+                "same in several samples cannot number them: leave it out"
+            )
         if self.is_float and self.bits is not None:
-            raise ValueError(f"expected 'bits' of a whole number, got {self.type}")
+            raise ValueError(f"expected 'bits' of a whole number, got {self.type}; leave them out")
         _require_bits(self.type, self.bits)
         return self
 
@@ -136,7 +155,10 @@ def _size(number_type: str) -> int:
 def _require_bits(number_type: str, bits: tuple[int, int] | None) -> None:
     last = 8 * _size(number_type) - 1
     if bits is not None and not 0 <= bits[0] <= bits[1] <= last:
-        raise ValueError(f"expected bits: [first, last] from 0 to {last} of {number_type}, got {list(bits)}")
+        raise ValueError(
+            f"expected bits: [first, last] from 0 to {last} of {number_type}, got {list(bits)}; of a number "
+            "across bytes take a type that holds all of it"
+        )
 
 
 class Constant(Model):
@@ -200,7 +222,10 @@ class Check(Model):
         if self.kind == "xor" and self.width != 8:
             raise ValueError(f"expected an xor of bytes, width 8, got {self.width}")
         if max(self.polynomial, self.init, self.xor_out) >> self.width:
-            raise ValueError(f"expected polynomial, init and xor_out of {self.width} bits, got more")
+            raise ValueError(
+                f"expected polynomial, init and xor_out of {self.width} bits, got more; a polynomial is "
+                "written without its highest term"
+            )
         return self
 
     @property

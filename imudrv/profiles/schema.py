@@ -8,6 +8,7 @@ from pydantic import Field as Key
 from pydantic import field_validator, model_validator
 
 from imudrv.files.model import Model
+from imudrv.profiles import advice
 from imudrv.profiles.messages import LOWEST_PDU2, Message, Order, SensorEntry, StatusBit
 from imudrv.profiles.translation import TICKS_PER_S, Translation
 from imudrv.profiles.version_1 import upgraded
@@ -82,6 +83,16 @@ class Profile(Model):
         """Return a document of version 1 in the words of this one."""
         return upgraded(document)
 
+    @classmethod
+    def advice_for_key(cls, path: str) -> str:
+        """Return the nearest thing that a profile can say; see `imudrv.profiles.advice`."""
+        return advice.for_key(path)
+
+    @classmethod
+    def advice_for_value(cls, path: str, value: object) -> str:
+        """Return the nearest thing that a profile can say; see `imudrv.profiles.advice`."""
+        return advice.for_value(path, value)
+
     @field_validator("status_bits")
     @classmethod
     def _no_duplicate_bits(cls, bits: tuple[StatusBit, ...]) -> tuple[StatusBit, ...]:
@@ -97,12 +108,13 @@ class Profile(Model):
             *self._header_faults(),
             *self._sensor_faults(),
             *self._sequence_faults(),
+            *self._tick_faults(),
             *self._status_and_temperature_faults(),
         ]
         if not 1 <= self.rate_hz <= 100_000:
             found.append(f"sample_rate_hz: expected 1 to 100000, got {self.rate_hz:g}")
         if found:
-            raise ValueError("; ".join(found))
+            raise ValueError("\n".join(found))
         return self
 
     def _serial_faults(self) -> Iterator[str]:
@@ -168,7 +180,10 @@ class Profile(Model):
                 yield f"{name}: expected all its fields in messages of every sample"
             axes = [n.axis or "" for n in numbers]
             if len(set(axes)) < len(axes):
-                yield f"{name}: expected each axis once, got {', '.join(sorted(axes))}"
+                yield (
+                    f"{name}: expected each axis once, got {', '.join(sorted(axes))}; a number in pieces "
+                    "cannot be described, unless it is one word with its bytes in order"
+                )
             units = _UNITS[name, "rate" if entry.values == "rate" else "other"]
             if entry.unit not in units:
                 yield (
@@ -204,9 +219,15 @@ class Profile(Model):
             yield "counter, time: expected one of them to number the samples, got both; leave one out"
         for k, message in enumerate(self.messages):
             if sum(n.name in ("counter", "time") for n in message.fields) > 1:
-                yield f"messages[{k}]: expected at most one counter or time, got more"
-        if len({(n.width, n.step, n.unit) for n in always}) > 1:
-            yield "counter: expected one width, step and unit in the messages of every sample, got several"
+                yield (
+                    f"messages[{k}]: expected at most one counter or time, got more; of a counter in pieces "
+                    "the lowest is enough"
+                )
+        if len({n.name for n in always}) == 1 and len({(n.width, n.step, n.unit) for n in always}) > 1:
+            yield (
+                "counter: expected one width, step and unit in the messages of every sample, got several; "
+                "a counter in one of them is enough"
+            )
         if everywhere and not always:
             yield "counter: expected it in a message of every sample"
         for n in always[:1]:
@@ -218,18 +239,31 @@ class Profile(Model):
                         f"time.step: expected {float(TICKS_PER_S[n.unit or 's'] / self.rate_hz):g} {n.unit} "
                         f"for {self.rate_hz:g} samples/s, got {n.step:g}; change one of them"
                     )
-            if n.name == "time" and not n.is_float:
-                ticks = Fraction(TICKS_PER_S[n.unit or "s"]) / self.rate
-                # Rounded times differ by up to a tick more or less, which must not be half a sample.
-                if ticks < 2 and ticks != 1:
-                    yield (
-                        f"time: expected a unit of which a sample takes 2 or more (or 1), "
-                        f"got {float(ticks):g} {n.unit} at {self.rate_hz:g} samples/s"
-                    )
             if n.name == "counter" and n.width < 64 and n.step is not None and n.step >= 1 << n.width:
                 yield (
                     f"counter.step: expected less than {1 << n.width}, for it has {n.width} bits, "
                     f"got {n.step:g}"
+                )
+
+    def _tick_faults(self) -> Iterator[str]:
+        """Yield what keeps a time in whole ticks from numbering the samples."""
+        times = [
+            n for m in self.messages if m.is_part for n in m.fields if n.name == "time" and not n.is_float
+        ]
+        for n in times[:1]:
+            ticks = Fraction(TICKS_PER_S[n.unit or "s"]) / self.rate
+            # Rounded times differ by up to a tick more or less, which must not be half a sample.
+            if ticks < 2 and ticks != 1:
+                yield (
+                    "time.unit: expected a unit of which a sample takes 2 or more (or 1), got "
+                    f"{float(ticks):g} {n.unit} at {self.rate_hz:g} samples/s; leave the field out, and "
+                    "samples are numbered as they arrive"
+                )
+            if 2 * ticks > 1 << n.width:
+                yield (
+                    f"time: expected a number that begins anew after two samples or more, got {n.width} bits "
+                    f"in {n.unit} at {self.rate_hz:g} samples/s; leave the field out, and samples are "
+                    "numbered as they arrive"
                 )
 
     def _status_and_temperature_faults(self) -> Iterator[str]:
