@@ -70,8 +70,8 @@ def capture(samples: int) -> list[bytes]:
     """Return the pieces of a damaged capture with random pulses."""
     random = np.random.default_rng(1)
     encoder = StreamEncoder(LAYOUT)
-    header = bytes(value for _, value in LAYOUT.messages[0].constants)
-    line = StreamFaults(Faults(stream=DAMAGE), header, seed=3)
+    (message,) = LAYOUT.messages
+    line = StreamFaults(Faults(stream=DAMAGE), [(message.length, message.header)], seed=3)
     pieces = []
     for first in range(0, samples, PIECE):
         pulses = np.zeros(min(PIECE, samples - first), PULSES)
