@@ -55,16 +55,16 @@ def wire(scenario: Scenario, layout: Layout, chunk: int = 65_536) -> Iterator[Wi
     """
     chunks = simulate(scenario, layout, chunk)
     if layout.can:
-        encoder, bus = CanEncoder(layout), MessageFaults(scenario.faults, scenario.seed)
+        messages, bus = CanEncoder(layout), MessageFaults(scenario.faults, scenario.seed)
         for part in chunks:
-            yield _messages(bus.apply(encoder.encode(part.pulses))[0], part.truth)
+            yield _messages(bus.apply(messages.encode(part.pulses))[0], part.truth)
         yield _messages(bus.close()[0], np.zeros(0, TRUTH))
         return
     kinds = [(message.length, message.header) for message in layout.messages if message.is_part]
-    encoder, line = StreamEncoder(layout), StreamFaults(scenario.faults, kinds, scenario.seed)
+    frames, line = StreamEncoder(layout), StreamFaults(scenario.faults, kinds, scenario.seed)
     for part in chunks:
         t_ns = np.repeat(part.pulses["arrival_ns"], len(kinds))
-        data, damage = line.apply(encoder.encode(part.pulses), t_ns)
+        data, damage = line.apply(frames.encode(part.pulses), t_ns)
         yield WireChunk(data, t_ns, np.cumsum(damage.size), part.truth)
 
 
