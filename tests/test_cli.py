@@ -139,7 +139,7 @@ def test_a_candump_log_works_for_the_can_profiles(bench: Path) -> None:
         ),
         (
             ["decode", "run.raw", "--profile", "imu51", "-o", "o.npz"],
-            "another one that `imudrv profiles` lists",
+            "or the path of a profile file",
         ),
         (
             ["decode", "run.raw", "--profile", "imu50-rs422", "-o", "o.txt"],

@@ -84,8 +84,8 @@ def test_a_file_of_datagrams_becomes_the_same_table(
     sent = encode(np.concatenate(list(recorded.increments())), Source.SIMULATOR)
     source = tmp_path / "out.i50n"
     source.write_bytes(sent + sent[:40])  # cut
-    assert export(recorded, "csv", tmp_path / "recording.csv") == (SAMPLES, 2)
-    assert export_datagrams(source, "csv", tmp_path / "file.csv") == (SAMPLES, 2)
+    export(recorded, "csv", tmp_path / "recording.csv")
+    export_datagrams(source, "csv", tmp_path / "file.csv")
     assert (tmp_path / "file.csv").read_bytes() == (tmp_path / "recording.csv").read_bytes()
     assert main(["export", str(source), "--to", "npz", "-o", str(tmp_path / "file.npz")]) == 0
     assert len(np.load(tmp_path / "file.npz")["counter"]) == SAMPLES

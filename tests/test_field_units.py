@@ -19,9 +19,12 @@ from numpy.typing import NDArray
 from imudrv import load_profile
 from imudrv.capture import Capture
 from imudrv.cli import main
+from imudrv.diagnosis import decode_traffic
+from imudrv.errors import InputError
 from imudrv.imu.sequence import SampleCounts, SequenceTracker
 from imudrv.ports import Arrival, Port, open_port
 from imudrv.records import EXTENDED, Flag, Reason, Records
+from imudrv.service.status import UnitStatus
 from imudrv.wire.candump import CandumpDecoder
 from imudrv.wire.decoder import FrameDecoder
 
@@ -329,6 +332,31 @@ def test_every_unit_with_a_capture_is_described(data: Path) -> None:
     assert captures == set(UNITS)
 
 
+def test_bits_that_mean_good_when_set_are_named_when_they_are_clear() -> None:
+    layout = load_profile("kvh1775").layout()
+    assert UnitStatus.of(0x77, layout) == UnitStatus(0x77, [], [])
+    assert UnitStatus.of(0x75, layout) == UnitStatus(0x75, ["gyro Y invalid"], ["gyro Y invalid"])
+
+
+@pytest.mark.parametrize("name", UNITS)
+def test_a_healthy_unit_has_no_bit_to_report(name: str, data: Path) -> None:
+    path = capture_path(data, name)
+    content = _messages(path) if path.suffix == ".log" else path.read_bytes()
+    traffic = decode_traffic(load_profile(name), content)
+    assert traffic.fits
+    assert traffic.set_bits == ()
+
+
+@pytest.mark.parametrize("name", UNITS)
+def test_the_profile_of_a_capture_is_found(name: str, data: Path) -> None:
+    if name.startswith("stim300-91"):
+        # Increments and totals have the same layout.
+        with pytest.raises(InputError, match="fits stim300-91 and stim300-91-totals equally well"):
+            Capture(capture_path(data, name))
+        return
+    assert Capture(capture_path(data, name)).profile.name == name
+
+
 @pytest.mark.parametrize(("name", "frames", "missing"), [("hole127", 1473, 127), ("hole200", 1400, 200)])
 def test_a_hole_before_an_8_bit_counter_costs_no_good_frame(
     name: str, frames: int, missing: int, data: Path
@@ -392,9 +420,13 @@ def _write(master: int, content: bytes) -> None:
             piece = piece[os.write(master, piece) :]
 
 
-def _through_can(path: Path, name: str) -> list[Arrival]:
+def _messages(path: Path) -> Records:
     log = CandumpDecoder()
-    messages = np.concatenate([log.feed(path.read_bytes())[0], log.close()[0]])
+    return np.concatenate([log.feed(path.read_bytes())[0], log.close()[0]])
+
+
+def _through_can(path: Path, name: str) -> list[Arrival]:
+    messages = _messages(path)
     port = open_port(f"can://virtual/{name}", load_profile(name))
     try:
         with can.Bus(name, "virtual", ignore_config=True) as unit:

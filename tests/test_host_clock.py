@@ -20,7 +20,6 @@ from imudrv.calibration import coefficients, write_calibration
 from imudrv.errors import InputError
 from imudrv.hostclock import Readings, now_ns, read_clocks
 from imudrv.imu.clock import ClockModel
-from imudrv.imu.rate_filter import rate_filter
 from imudrv.pipeline import Pipeline
 from imudrv.recording import format
 from imudrv.recording.pack import pack
@@ -360,7 +359,7 @@ def test_live_and_offline_agree_wherever_the_steps_and_the_reads_fall(
     edges = [0, *sorted(cuts), 44 * 400, 44 * 401, len(wire)]
     reads = [bytes(wire[a:b]) for a, b in pairwise(sorted(edges)) if a < b]
     arrivals = [Arrival(BEGIN + k * MS, data, bases[k % len(bases)]) for k, data in enumerate(reads)]
-    pipeline = Pipeline(profiles.load("imu50-rs422"), coefficients(NOMINAL), rate_filter("dither", MS))
+    pipeline = Pipeline(profiles.load("imu50-rs422"), coefficients(NOMINAL), "dither")
     live = []
     with TemporaryDirectory() as folder:
         kept = recorder(Path(folder) / "run.mcap")

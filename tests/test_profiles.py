@@ -130,7 +130,7 @@ def test_the_profiles_of_the_icd_ship_with_its_line_and_rate() -> None:
 @pytest.mark.parametrize("document", INVENTED.values(), ids=INVENTED.keys())
 def test_an_invented_profile_works_by_path_without_code(document: dict[str, object], tmp_path: Path) -> None:
     layout = profiles.load(written(tmp_path, document)).layout()
-    span = 1 << layout.counter_bits
+    span = 1 << layout.sequence.bits
     sent = some_pulses(layout, 3000, first=span - 1000)  # across the counter's wrap
     wire = StreamEncoder(layout).encode(sent).tobytes()
     decoder, tracker = StreamDecoder(layout), SequenceTracker(layout)
@@ -161,12 +161,12 @@ def test_all_faults_of_a_profile_are_reported_at_once(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"messages": [message(3, "u24", "u8", None)]}, "signed pulse increments"),
+        ({"messages": [message(3, "u24", "u8", None)]}, "expected a signed type"),
         ({"transport": "can"}, "bitrate"),
         ({"messages": [message(3, "i24", "u8", None) | {"length": 10}]}, "within 10 bytes"),
         ({"messages": [message(3, "i24", "u8", None) | {"sync": "AA 55 0D 01"}]}, "inside sync"),
         ({"messages": [message(3, "i24", "i8", None)]}, "unsigned"),
-        ({"sample_rate_hz": 300}, "whole nanoseconds"),
+        ({"sample_rate_hz": [1, 2]}, "sample_rate_hz: expected 1 to 100000, got 0.5"),
         ({"messages": [message(3, "i24", "u8", {"kind": "crc", "width": 16})]}, "polynomial"),
         (
             {
@@ -195,5 +195,5 @@ def test_a_shipped_profile_is_of_its_name_and_says_where_it_is_from(name: str) -
 
 
 def test_an_unknown_profile_names_the_shipped_ones() -> None:
-    with pytest.raises(InputError, match=r"imu50-rs422-acc.*imudrv profiles"):
+    with pytest.raises(InputError, match=r"imu50-rs422-acc.* or the path of a profile file"):
         profiles.load("imu51")

@@ -82,9 +82,9 @@ def test_a_capture_without_frames_says_what_was_seen_and_which_profile_fits(
     out = str(tmp_path / "out.csv")
     assert main(["decode", str(capture), "--profile", "imu50-rs422-acc", "-o", out]) == 2
     assert capsys.readouterr().err == (
-        f"error: {capture}: expected frames of imu50-rs422-acc, got none in {COUNT * 44} bytes: "
+        f"error: {capture}: expected frames of imu50-rs422-acc, got none in {COUNT * 44} bytes of binary data: "
         f"sync EB 90 seen {COUNT} times, check never right; "
-        "this looks like imu50-rs422: try --profile imu50-rs422\n"
+        "its beginning has frames of imu50-rs422: try --profile imu50-rs422\n"
     )
     assert main(["decode", str(capture), "--profile", "imu50-can", "-o", out]) == 2
-    assert "this looks like imu50-rs422: try --profile imu50-rs422" in capsys.readouterr().err
+    assert "its beginning has frames of imu50-rs422: try --profile imu50-rs422" in capsys.readouterr().err

@@ -269,9 +269,9 @@ class SessionController:
 
 def _conditions(pulses: Records, layout: Layout) -> Conditions:
     """Return faults and temperatures of a sample."""
-    faults = int(pulses["status"]) & layout.status.fault
+    bits = layout.active_bits(int(pulses["status"]))
     degc = zip(layout.temperature_names, pulses["temperature_degc"].tolist(), strict=False)
     return Conditions(
-        tuple(name for bit, name in layout.status_names if faults >> bit & 1),
+        tuple(name for mask, name in bits.items() if mask & layout.status.fault),
         {name: None if isnan(t) else t for name, t in degc},
     )

@@ -92,7 +92,9 @@ _BY_LINE: Final = (
 )
 _TIME: Final = re.compile(rb"^ ?\((\d{1,10})\.(\d{6})\d*\) ", re.MULTILINE)
 _EPOCH_FROM_US: Final = 10**14
+"""Times from here on, 1973, are those of a clock."""
 _MANY_RANGES: Final = 10
+"""Two channels in turn go twice over their range, or three times."""
 _LOOKED_AT: Final = 1 << 13
 """Number of bytes in which a line of the format has to come."""
 _CONTROL: Final = re.compile(rb"[\0-\x08\x0e-\x1a\x1c-\x1f]")

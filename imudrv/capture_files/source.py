@@ -13,7 +13,7 @@ import zstandard
 
 from imudrv.capture_files.recognise import GZIP, ZSTANDARD, Kind
 
-CHUNK_BYTES: Final = 1 << 19
+CHUNK_BYTES: Final = 1 << 17
 """Bytes read at once: few enough for the cache, many enough that Python's overhead does not matter."""
 LONGEST_LINE: Final = 1 << 16
 """Maximum length of a line, bytes."""

@@ -30,7 +30,15 @@ def print_losses(capture: Capture, output: Path) -> int:
     print(f"{capture.path}: {capture.layout.name}, {capture.size} bytes{what} -> {output}", file=stream)
     if capture.is_profile_found:
         print(f"  profile {capture.layout.name}: found, for it fits best of the shipped ones", file=stream)
-    print(f"  {capture.tracker.counts}", file=stream)
+    counts = capture.tracker.counts
+    print(f"  {counts}", file=stream)
+    if counts.unknown_gaps:
+        a_round = float(capture.layout.samples_a_round)
+        print(
+            f"  {counts.unknown_gaps} gaps of unknown length, counted with the smallest: each may be {a_round:g} "
+            "longer, any number of times, for there are no times of arrival",
+            file=stream,
+        )
     for reason, rejected in sorted(capture.rejected.items()):
         name = reason.name.lower().replace("_", " ")
         first = ", ".join(map(str, rejected.first))

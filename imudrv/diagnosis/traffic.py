@@ -92,7 +92,9 @@ def decode_traffic(profile: Profile, data: bytes | Records) -> TrafficSummary:
         frames = np.concatenate([frames, decoder.close()])  # held until their full counter arrives
     tracker = SequenceTracker(layout)
     pulses = tracker.feed(frames)
-    status = int(np.bitwise_or.reduce(pulses["status"])) if pulses.size else 0
+    active: dict[int, str] = {}
+    for status in np.unique(pulses["status"]).tolist():
+        active |= layout.active_bits(status)
     degc = pulses["temperature_degc"][-1].tolist() if pulses.size else []
     if isinstance(data, bytes):
         share = frames.size * sum(m.length for m in profile.messages if m.every == 1) / max(len(data), 1)
@@ -111,7 +113,7 @@ def decode_traffic(profile: Profile, data: bytes | Records) -> TrafficSummary:
         tracker.counts,
         rejected,
         messages,
-        tuple(name for bit, name in layout.status_names if status >> bit & 1),
+        tuple(active[mask] for mask in sorted(active)),
         dict(zip(layout.temperature_names, degc, strict=False)),
     )
 
@@ -131,7 +133,8 @@ def line_load(profile: Profile) -> float:
     """
     line, rate = profile.line, profile.rate_hz
     if isinstance(line, SerialLine):
-        return profile.transmission_ns * NS * rate
+        others = sum(m.length for m in profile.messages if not m.is_part)  # at least one each a sample
+        return (profile.transmission_ns * NS + others * line.bits_a_byte / line.baudrate) * rate
     if line.data_bitrate is not None:
         return _STUFFING * (profile.transmission_ns * NS + _IDLE_BITS / line.bitrate) * rate
     # ISO 11898-1: a bit is stuffed after five equal ones, in 34 bits of overhead and in the data

@@ -62,6 +62,8 @@ def missing_periods(a: np.void, t_ns: int, elapsed_ns: int, period_ns: float, in
     missing = 0
     if late - jitter > period_ns / 2:
         missing = max(1, int(np.rint((late - jitter / 2) / period_ns)))
+        # No sample is early: one that is late by less than a period follows a pause.
+        missing = min(missing, int((late + jitter + interval_ns) / period_ns))
         late -= int(missing * period_ns)
     a["late_ns"][a["slot"]] = late
     a["slot"] = (a["slot"] + 1) % KEPT

@@ -101,9 +101,9 @@ def constants(layout: Layout) -> Records:
     c["interval_ns"], c["parts"] = layout.interval_ns, interval.denominator
     c["remainder"] = interval.numerator % interval.denominator
     c["sequence"], c["bits"] = sequence.kind, sequence.bits
-    c["narrow"] = sequence.kind is SequenceKind.COUNTER and sequence.bits < NARROW_BITS
     c["step"], c["step_parts"] = sequence.step.numerator, sequence.step.denominator
-    c["span"] = 1.0 if sequence.kind is SequenceKind.NONE else 2.0**sequence.bits / sequence.step
+    c["span"] = layout.samples_a_round
+    c["narrow"] = sequence.kind is not SequenceKind.NONE and c["span"] < 1 << NARROW_BITS
     c["totals"] = any(sensor.values is Values.TOTAL for sensor in layout.sensors if any(sensor.axes))
     c["bridges"] = layout.totals
     for name, sensor in zip(("gyro", "accelerometer"), layout.sensors, strict=True):
@@ -117,7 +117,7 @@ def constants(layout: Layout) -> Records:
 
 
 def _fill_sensor(c: np.void, sensor: Sensor) -> None:
-    c["values"], c["in_pulses"] = sensor.values, sensor.in_pulses
+    c["values"], c["in_pulses"] = sensor.values, sensor.is_counted
     c["per_count"] = sensor.per_count
     for k, axis in enumerate(sensor.axes):
         if axis is None:

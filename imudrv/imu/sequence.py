@@ -55,8 +55,6 @@ class SampleCounts:
     """Lost samples whose pulses are in the next running total; they are counted as lost as well."""
     unknown_gaps: int
     """Gaps with their smallest length: no time of arrival tells how often the counter went round."""
-    other_step: int
-    """Frames behind a gap as long as the gap before: many of them show a wrong step in the profile."""
 
     @property
     def closes(self) -> bool:
@@ -98,7 +96,6 @@ STATE: Final = np.dtype(
         ("fraction", np.int64),  # of a ns that is not in it, of `parts`
         ("arrival_ns", np.int64),  # of the newest frame
         ("arrivals", ARRIVALS),
-        ("advance", np.int64),  # of the newest frame behind a gap, samples
         ("lost_before", np.bool_),  # samples are missing before the next one that is output
         ("damaged", np.int64),  # frames' worth of bytes, and frames with an invalid counter, since `newest`
         ("torn", np.int64),  # samples given up before those frames
@@ -255,7 +252,9 @@ def _forward(frames: Records, i: int, c: np.void, s: np.void) -> int:
     frame = frames[i]
     t_ns = frame["t_ns"]
     period_ns = c["span"] * c["interval_ns"]
-    is_soon = t_ns and s["arrival_ns"] and t_ns - s["arrival_ns"] < period_ns / 2
+    # When the newest frame came without delay; its own time may be that of a reader that paused.
+    newest_ns = s["arrivals"]["least_ns"] + s["elapsed_ns"]
+    is_soon = t_ns and s["arrivals"]["t_ns"] and t_ns - newest_ns < period_ns / 2
     ahead = _one_forward(frame, s["ticks"], is_soon, c)
     if t_ns == 0 or t_ns == s["arrivals"]["t_ns"]:
         return ahead
@@ -321,8 +320,6 @@ def _advance(frame: np.void, ahead: int, c: np.void, s: np.void, n: np.void) -> 
         _count_ticks(frame, ahead, c, s)
         s["received"] = (s["received"] << ahead | 1) if ahead < WINDOW else 1
         if ahead > 1:
-            n["other_step"] += ahead == s["advance"]
-            s["advance"] = ahead
             _count_lost(ahead - 1, frame, s, n)
         return ahead
     _count_behind(ahead, s, n)

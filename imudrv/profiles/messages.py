@@ -68,7 +68,7 @@ class Number(Model):
     unit: Literal["s", "ms", "us", "ns"] | None = None
     step: Annotated[float, Key(gt=0, le=1e12)] | None = None
     sensor: SensorName | None = None
-    degc_per_count: Annotated[float, Key(gt=0, le=1000)] = 1.0
+    degc_per_count: Annotated[float, Key(ge=-1000, le=1000)] = 1.0
     degc_at_zero: Annotated[float, Key(ge=-1000, le=1000)] = 0.0
     only_while: Selector | None = None
 
@@ -94,6 +94,8 @@ class Number(Model):
                 "expected 'only_while' with temperature and status only; a sensor's numbers that take turns "
                 "are messages of their own, told apart by their constants"
             )
+        if self.degc_per_count == 0.0:
+            raise ValueError("expected a degc_per_count other than 0, got 0")
         if self.is_float and self.name in ("counter", "status"):
             raise ValueError(f"expected a whole number for {self.name}, got {self.type}")
         if self.name in ("counter", "time", "status") and self.type[0] == "i":
@@ -290,7 +292,7 @@ class SensorEntry(Model):
 
 
 class StatusBit(Model):
-    """A bit of the status word: its name in messages, and its effect on the samples while it is set or clear."""
+    """A bit of the status word: its name in messages, and its effect on samples while it is set or clear."""
 
     bit: Annotated[int, Key(ge=0, le=31)]
     name: Annotated[str, Key(min_length=1, max_length=64)]

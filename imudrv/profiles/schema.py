@@ -38,6 +38,11 @@ class SerialLine(Model):
     parity: Literal["none", "even", "odd", "mark", "space"] = "none"
     stopbits: Literal[1, 2] = 1
 
+    @property
+    def bits_a_byte(self) -> int:
+        """Bits of a byte on the line: start, data, parity, stop."""
+        return 1 + self.bytesize + (self.parity != "none") + self.stopbits
+
 
 class CanLine(Model):
     """Settings of a CAN bus."""
@@ -109,7 +114,7 @@ class Profile(Model):
             if (message.id, message.pgn, message.source, message.extended) != (None,) * 4:
                 yield f"messages[{k}]: expected no 'id', 'pgn', 'source' or 'extended' in a serial profile"
             if message.every != 1:
-                yield f"messages[{k}].every: expected none in a serial profile, whose messages come as they come"
+                yield f"messages[{k}].every: expected none in a serial profile; messages may come at any rate"
 
     def _can_faults(self) -> Iterator[str]:
         if not isinstance(self.line, CanLine):
@@ -117,17 +122,25 @@ class Profile(Model):
         longest = 64 if self.fd else 8
         for k, message in enumerate(self.messages):
             if (message.id is None) == (message.pgn is None):
-                yield f"messages[{k}]: expected 'id', a CAN identifier, or 'pgn', a parameter group of J1939"
+                yield f"messages[{k}]: expected 'id', a CAN identifier, or 'pgn', a J1939 parameter group"
             if message.pgn is None and message.source is not None:
                 yield f"messages[{k}].source: expected with 'pgn' only; it is part of 'id'"
             if message.pgn is not None and message.pgn < LOWEST_PDU2 and message.pgn & 0xFF:
-                yield f"messages[{k}].pgn: expected 00 as the low byte of a group below F000, got {message.pgn:X}"
+                yield (
+                    f"messages[{k}].pgn: expected 00 as the low byte of a group below F000, "
+                    f"got {message.pgn:X}"
+                )
             if message.extended is not None and (message.pgn is not None or (message.id or 0) > 0x7FF):
-                yield f"messages[{k}].extended: expected with an 'id' up to 0x7FF only; this one has 29 bits anyway"
+                yield (
+                    f"messages[{k}].extended: expected with an 'id' up to 0x7FF only; "
+                    "this one has 29 bits anyway"
+                )
             if message.sync is not None:
                 yield f"messages[{k}].sync: expected none in a CAN profile"
             if message.length > longest or message.length not in _CAN_FD_LENGTHS:
-                yield f"messages[{k}].length: expected a CAN data length up to {longest}, got {message.length}"
+                yield (
+                    f"messages[{k}].length: expected a CAN data length up to {longest}, got {message.length}"
+                )
 
     def _header_faults(self) -> Iterator[str]:
         """Yield the messages that cannot be told from one before."""
@@ -147,7 +160,7 @@ class Profile(Model):
             numbers = [n for m in self.messages for n in m.fields if n.name == name]
             if entry is None:
                 if numbers:
-                    yield f"{name}: expected an entry that says what the numbers are, for there are fields of it"
+                    yield f"{name}: expected an entry that says what the numbers of its fields are"
                 continue
             if not numbers:
                 yield f"{name}: expected fields of it, or no entry"
@@ -158,10 +171,15 @@ class Profile(Model):
                 yield f"{name}: expected each axis once, got {', '.join(sorted(axes))}"
             units = _UNITS[name, "rate" if entry.values == "rate" else "other"]
             if entry.unit not in units:
-                yield f"{name}.unit: expected {' or '.join(units)} for values: {entry.values}, got {entry.unit}"
+                yield (
+                    f"{name}.unit: expected {' or '.join(units)} for values: {entry.values}, got {entry.unit}"
+                )
             for n in numbers:
                 if entry.unit == "pulse" and (n.is_float or n.per_count or entry.per_count):
-                    yield f"{name}: expected pulses as whole numbers without 'per_count'; their scale is calibrated"
+                    yield (
+                        f"{name}: expected pulses as whole numbers without 'per_count'; "
+                        "their scale is calibrated"
+                    )
                     break
                 if entry.values != "total" and n.type[0] == "u" and n.zero == 0:
                     yield (
@@ -200,14 +218,28 @@ class Profile(Model):
                         f"time.step: expected {float(TICKS_PER_S[n.unit or 's'] / self.rate_hz):g} {n.unit} "
                         f"for {self.rate_hz:g} samples/s, got {n.step:g}; change one of them"
                     )
+            if n.name == "time" and not n.is_float:
+                ticks = Fraction(TICKS_PER_S[n.unit or "s"]) / self.rate
+                # Rounded times differ by up to a tick more or less, which must not be half a sample.
+                if ticks < 2 and ticks != 1:
+                    yield (
+                        f"time: expected a unit of which a sample takes 2 or more (or 1), "
+                        f"got {float(ticks):g} {n.unit} at {self.rate_hz:g} samples/s"
+                    )
             if n.name == "counter" and n.width < 64 and n.step is not None and n.step >= 1 << n.width:
-                yield f"counter.step: expected less than {1 << n.width}, for it has {n.width} bits, got {n.step:g}"
+                yield (
+                    f"counter.step: expected less than {1 << n.width}, for it has {n.width} bits, "
+                    f"got {n.step:g}"
+                )
 
     def _status_and_temperature_faults(self) -> Iterator[str]:
         numbers = [n for m in self.messages for n in m.fields]
         bits = sum(n.width for n in numbers if n.name == "status")
         if bits > 32:
-            yield f"status: expected at most 32 bits in all, got {bits}; take those of use with bits: [first, last]"
+            yield (
+                f"status: expected at most 32 bits in all, got {bits}; "
+                "take those of use with bits: [first, last]"
+            )
         for b in self.status_bits:
             if b.bit >= bits:
                 yield f"status_bits: expected bits below {bits}, the width of the status fields, got {b.bit}"
@@ -238,8 +270,7 @@ class Profile(Model):
         parts = [m for m in self.messages if m.is_part]
         lengths = [m.length for m in parts]
         if isinstance(self.line, SerialLine):
-            bits_a_byte = 1 + self.line.bytesize + (self.line.parity != "none") + self.line.stopbits
-            return round(sum(lengths) * bits_a_byte * NS_PER_S / self.line.baudrate)
+            return round(sum(lengths) * self.line.bits_a_byte * NS_PER_S / self.line.baudrate)
         if self.line.data_bitrate is None:
             bits = sum(_CLASSIC_BITS[m.can_id[0] & EXTENDED != 0] + 8 * m.length for m in parts)
             return round(bits * NS_PER_S / self.line.bitrate)

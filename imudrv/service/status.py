@@ -81,7 +81,7 @@ class RejectedStatus:
 
 @dataclass(frozen=True)
 class UnitStatus:
-    """Status word of the latest sample, and the names of its bits that are set and that mean a fault."""
+    """Status word of the latest sample, and the names of its bits that apply and that mean a fault."""
 
     word: int
     bits: list[str]
@@ -90,8 +90,8 @@ class UnitStatus:
     @classmethod
     def of(cls, word: int, layout: Layout) -> Self:
         """Name the bits of a status word."""
-        bits = [(1 << bit, name) for bit, name in layout.status_names if word >> bit & 1]
-        return cls(word, [name for _, name in bits], [n for mask, n in bits if mask & layout.status.fault])
+        bits = layout.active_bits(word)
+        return cls(word, list(bits.values()), [n for mask, n in bits.items() if mask & layout.status.fault])
 
 
 @dataclass(frozen=True)

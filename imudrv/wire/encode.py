@@ -250,7 +250,7 @@ class CanEncoder(_Encoder):
 
 
 def _columns(numbers: list[Ints], rows: int) -> Ints:
-    return np.array(numbers, np.int64).reshape(-1, rows).T
+    return np.array(numbers, np.int64).reshape(len(numbers), rows).T
 
 
 def _limits(bits: int, signed: bool) -> tuple[int, int]:
@@ -274,7 +274,7 @@ def _read(rows: NDArray[np.uint8], field: Field) -> Ints:
     word = np.zeros(len(rows), np.int64)
     for k in order:
         word = word << 8 | rows[:, field.offset + k]
-    return word >> field.shift & ((1 << field.bits) - 1)
+    return word if field.bits == 64 else word >> field.shift & ((1 << field.bits) - 1)
 
 
 @kernel

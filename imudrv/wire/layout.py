@@ -19,8 +19,9 @@ MAX_MESSAGES: Final = 16
 """Kinds of message that a profile may have."""
 MAX_RANGES: Final = 4
 """Ranges of bytes that a check may cover."""
-NARROW_BITS: Final = 16
-"""A counter of fewer bits wraps within seconds: what it says about a gap depends on the time of arrival."""
+NARROW_BITS: Final = 12
+"""A counter of fewer bits, or a time of fewer samples, wraps within seconds: what it says about a gap depends
+on the time of arrival."""
 
 
 class CheckKind(IntEnum):
@@ -339,6 +340,18 @@ class Layout:
     def counter_step(self) -> int:
         """Change of a sample's `counter` from one to the next."""
         return int(self.sequence.step) if self.sequence.kind is SequenceKind.COUNTER else 1
+
+    def active_bits(self, status: int) -> dict[int, str]:
+        """Return mask and name of the bits of a status word that apply: set, or clear if inverted."""
+        active = status ^ self.status.inverted
+        return {1 << bit: name for bit, name in self.status_names if active >> bit & 1}
+
+    @property
+    def samples_a_round(self) -> Fraction:
+        """Samples until the counter or time begins anew; 1 without one: a gap may then have any length."""
+        if self.sequence.kind is SequenceKind.NONE:
+            return Fraction(1)
+        return Fraction(2**self.sequence.bits) / self.sequence.step
 
     @property
     def sensors(self) -> tuple[Sensor, Sensor]:

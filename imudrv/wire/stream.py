@@ -61,8 +61,8 @@ class StreamDecoder:
     """Decoder of a byte stream; feed it bytes as they arrive, in any pieces.
 
     The frames and rejects are the same for any cut of the stream into pieces, and every byte fed is in a
-    frame, in a reject, in a good message that is no part of a sample, or among the `pending` ones. After a bad
-    message the search resumes at its second byte.
+    frame, in a reject, in a good message that is no part of a sample, or among the `pending` ones. After a
+    bad message the search resumes at its second byte.
 
     Parameters
     ----------

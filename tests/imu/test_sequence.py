@@ -11,12 +11,18 @@ from hypothesis import strategies as st
 from imudrv.imu.conversion import MAX_INTERVAL_NS
 from imudrv.imu.sequence import WINDOW, SampleCounts, SequenceTracker
 from imudrv.profiles import load
-from imudrv.records import FRAME, NO_TEMPERATURE, Flag, Records
-from imudrv.wire.layout import Layout
+from imudrv.records import FRAME, Flag, Records
+from imudrv.wire.layout import Layout, SequenceKind
+from imudrv.wire.layout import Sequence as Numbering
 
 INCREMENTS = load("imu50-rs422").layout()
 TOTALS = load("imu50-rs422-acc").layout()
 TAU = 1_000_000
+
+
+def with_counter(bits: int, layout: Layout = INCREMENTS) -> Layout:
+    """A layout with another counter."""
+    return replace(layout, sequence=Numbering(SequenceKind.COUNTER, bits))
 
 
 def frames(counters: Sequence[int], **columns: object) -> Records:
@@ -62,7 +68,7 @@ def test_an_unbroken_run_is_passed_on_complete():
 
 @pytest.mark.parametrize("bits", [8, 16, 32])
 def test_the_counter_goes_across_its_wrap(bits):
-    layout = replace(INCREMENTS, counter_bits=bits)
+    layout = with_counter(bits)
     top = 2**bits
     pulses, counts = run([top - 2, top - 1, 0, 1], layout)
     assert anomalies(counts) == {}
@@ -71,14 +77,14 @@ def test_the_counter_goes_across_its_wrap(bits):
 
 @pytest.mark.parametrize("bits", [8, 16, 32])
 def test_losses_across_the_wrap_are_counted(bits):
-    layout = replace(INCREMENTS, counter_bits=bits)
+    layout = with_counter(bits)
     pulses, counts = run([2**bits - 1, 5], layout)
     assert anomalies(counts) == {"missing": 5}
     assert pulses["elapsed_ns"].tolist() == [TAU, 7 * TAU]
 
 
 def test_a_counter_of_8_bits_goes_around_many_times():
-    layout = replace(INCREMENTS, counter_bits=8)
+    layout = with_counter(8)
     pulses, counts = run([i % 256 for i in range(1000)], layout)
     assert anomalies(counts) == {}
     assert pulses["counter"].tolist() == list(range(1000))
@@ -249,8 +255,8 @@ def test_a_count_at_the_end_of_its_width_is_saturated(sensor, pulse, saturated):
 
 
 def test_temperatures_are_in_degrees_and_unreceived_ones_are_unknown():
-    counts = np.zeros((1, 6), np.int32)
-    counts[0, :4] = [3512, NO_TEMPERATURE, -5, 0]
+    counts = np.full((1, 6), np.nan)
+    counts[0, :4] = [3512, np.nan, -5, 0]
     pulses, _ = run([1], temperature=counts)
     expected = [35.12, np.nan, -0.05, 0.0, np.nan, np.nan]
     assert np.array_equal(pulses["temperature_degc"][0], expected, equal_nan=True)
@@ -263,7 +269,7 @@ ARRIVALS = st.lists(st.tuples(STEPS, st.integers(0, 4), st.integers(0, 3)), min_
 
 @given(st.integers(0, 2**32 - 1), ARRIVALS, st.sampled_from([8, 16, 32]), st.booleans(), st.integers(0, 60))
 def test_the_counts_add_up_for_any_counters_and_any_batches(first, arrivals, bits, running, cut):
-    layout = replace(TOTALS if running else INCREMENTS, counter_bits=bits)
+    layout = with_counter(bits, TOTALS if running else INCREMENTS)
     steps, damaged, torn = np.array(arrivals).T
     gyro = np.random.default_rng(first).integers(0, 100, (len(steps), 3))
     rows = frames((first + np.cumsum(steps)) % 2**bits, damaged=damaged, torn=torn, gyro=gyro)
