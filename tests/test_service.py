@@ -683,8 +683,8 @@ def test_a_unit_of_another_maker_is_served_and_healthy(profile: str, tmp_path: P
         assert status["unit_status"]["faults"] == []
         up = status["last"]["dv_b"][2]
         if any(load(profile).layout().accelerometer.axes):
-            # at rest, g for a sample; a count of witmotion is 0.5 mg, and a sample 1 ns longer or shorter
-            assert up == pytest.approx(9.79 / second, rel=1e-3)
+            # At rest, g for a sample; the dither shakes the case by 1 m/s^2 at 1 kHz. Wrong units: a factor of 10.
+            assert up == pytest.approx(9.79 / second, rel=0.3)
         else:
             assert up is None or np.isnan(up)
         assert service.stop() == 0
