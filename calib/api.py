@@ -7,7 +7,7 @@ from pathlib import Path
 from calib.certificate import lever_arms_of
 from calib.estimation.predict import PlannedRotation, Prediction
 from calib.estimation.predict import predict as predict_plan
-from calib.inputs import StrPath, profile_of, site_of
+from calib.inputs import StrPath, profile_of, require_six_axes, site_of
 from calib.procedure import plan
 from calib.procedure.schema import Procedure
 from calib.validation.navigate import navigate
@@ -70,7 +70,8 @@ def validate(
         lever_arms_of(calibration, name)
     path = Path(capture)
     opened = Capture(path, profile_of(profile), channel)
-    settings = TrialSettings(opened.layout, calibration, site_of(site), align_s, rate_filter, skew_s)
+    layout = require_six_axes(opened.layout)
+    settings = TrialSettings(layout, calibration, site_of(site), align_s, rate_filter, skew_s)
     return evaluate(navigate(path.name, opened.pulses(advance), settings))
 
 

@@ -20,7 +20,7 @@ from calib.estimation.joint import estimate_joint
 from calib.estimation.plain import estimate_plain
 from calib.estimation.result import TO_DIFFERENCES, Extra, LeverArmEstimate, RunResult
 from calib.estimation.runs import CaptureRuns, Priors, Run, navigate_capture
-from calib.inputs import StrPath, profile_of, site_of
+from calib.inputs import StrPath, profile_of, require_six_axes, site_of
 from calib.lever_arms.gauge import LeverArms
 from calib.messages import english
 from imudrv.arrays import Array
@@ -380,11 +380,11 @@ def _read(
     try:
         with unchanged(path):  # two passes, and one for the hash
             capture = Capture(path, profile, channel)
-            rotations = navigate_capture(pulses, capture.layout, calibration, site, label)
+            layout = require_six_axes(capture.layout)
+            rotations = navigate_capture(pulses, layout, calibration, site, label)
             digest = sha256(path)
     except InputError as error:
         raise error if str(path) in str(error) else InputError(f"{path}: {error}") from None
-    layout = capture.layout
     temperatures = temperature_ranges(layout.temperature_names, low, high)
     counts = str(capture.tracker.counts)
     return CaptureSummary(label, path.name, digest, layout.name, counts, temperatures, rotations, channel)

@@ -34,7 +34,7 @@ from imudrv.records import PULSES, Flag
 from imudrv.service.loop import Service as Driver
 from imudrv.service.settings import Settings
 from imudrv.service.status_socket import ask
-from imudrv.sim.scenario import NOMINAL
+from imudrv.sim.scenario import NOMINAL, nominal
 from imudrv.terminal import INTERRUPTED
 from imudrv.units import ARCSEC
 from imudrv.wire.encode import StreamEncoder
@@ -665,6 +665,28 @@ def test_an_absent_receiver_has_no_effect(folder: Path) -> None:
             until(is_reported, "the state")
         assert seen[-1]["health"] in ("warn", "fail")
         until(lambda: service.good() == unit.counter, "all samples")
+        assert service.stop() == 0
+
+
+@pytest.mark.parametrize("profile", ["kvh1775", "witmotion", "exail-asterix"])
+def test_a_unit_of_another_maker_is_served_and_healthy(profile: str, tmp_path: Path) -> None:
+    write_calibration(tmp_path / "unit.yaml", nominal(load(profile).layout()))
+    arguments = ["--port", tmp_path / "unit", "--profile", profile, "--calibration", "unit.yaml"]
+    with simulated(tmp_path, profile), serving(tmp_path, *arguments) as service:
+        second = round(load(profile).rate_hz)
+        until(lambda: service.good() > 6 * second, "six seconds' samples")  # a rate is judged after four
+        until(lambda: service.status()["clock"]["locked"], "the clock")
+        as_json = service.command("status", "--json")
+        status = json.loads(as_json.stdout)
+        assert (as_json.returncode, status["reasons"]) == (0, [])
+        assert status["samples"]["lost_last_s"] == 0
+        assert status["unit_status"]["faults"] == []
+        up = status["last"]["dv_b"][2]
+        if any(load(profile).layout().accelerometer.axes):
+            # At rest, g for a sample; the dither shakes the case by 1 m/s^2 at 1 kHz. Wrong units: a factor of 10.
+            assert up == pytest.approx(9.79 / second, rel=0.3)
+        else:
+            assert up is None or np.isnan(up)
         assert service.stop() == 0
 
 

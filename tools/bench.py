@@ -19,6 +19,8 @@ import struct
 import time
 from collections.abc import Callable
 from dataclasses import asdict
+from itertools import islice
+from math import inf
 from typing import Final
 
 import numba
@@ -34,9 +36,12 @@ from imudrv.imu.compensation import Compensator
 from imudrv.imu.sequence import SequenceTracker
 from imudrv.profiles import load
 from imudrv.records import PULSES, Flag, Records
+from imudrv.sim.capture import wire
 from imudrv.sim.faults import StreamFaults
 from imudrv.sim.scenario import Faults, StreamRates
+from imudrv.sim.scenario import load as load_scenario
 from imudrv.units import ARCSEC, DEG_PER_H, UG
+from imudrv.wire.decoder import FrameDecoder
 from imudrv.wire.encode import StreamEncoder
 from imudrv.wire.stream import StreamDecoder
 
@@ -55,6 +60,11 @@ SLOW_SAMPLES: Final = 16 * PIECE
 DAMAGE: Final = StreamRates(
     bit_flips=0.004, bytes_lost=0.004, bytes_inserted=0.004, false_sync_between=0.004, frame_lost=0.004
 )
+OTHERS: Final = (
+    ("kvh1775", "f32 and a counter of 7 bits", "imu50-rs422"),
+    ("bosch-mm7", "bit fields, three messages", "imu50-can"),
+)
+"""Profiles of other makers, what is in them, and the profile of our unit on the same kind of line."""
 CALIBRATION: Final = Coefficients(
     gyro_scale=np.array([0.45, 0.76, 0.85]) * ARCSEC,
     gyro_bias=np.array([0.2, -0.3, 0.1]) * DEG_PER_H,
@@ -70,8 +80,8 @@ def capture(samples: int) -> list[bytes]:
     """Return the pieces of a damaged capture with random pulses."""
     random = np.random.default_rng(1)
     encoder = StreamEncoder(LAYOUT)
-    header = bytes(value for _, value in LAYOUT.messages[0].constants)
-    line = StreamFaults(Faults(stream=DAMAGE), header, seed=3)
+    (message,) = LAYOUT.messages
+    line = StreamFaults(Faults(stream=DAMAGE), [(message.length, message.header)], seed=3)
     pieces = []
     for first in range(0, samples, PIECE):
         pulses = np.zeros(min(PIECE, samples - first), PULSES)
@@ -225,6 +235,29 @@ def throughput(rounds: int) -> list[Measure]:
     ]
 
 
+def decode_of_others(rounds: int) -> list[Measure]:
+    """Measure the decoder with profiles of other makers against those of our unit, in alternating rounds."""
+    measures = []
+    for name, kind, own in OTHERS:
+        layouts = [load(name).layout(), load(own).layout()]
+        captures = [
+            [piece.data for piece in islice(wire(load_scenario("static"), layout, PIECE), SAMPLES // PIECE)]
+            for layout in layouts
+        ]
+        seconds = [inf, inf]
+        for _ in range(rounds):
+            for k, (layout, pieces) in enumerate(zip(layouts, captures, strict=True)):
+                decoder = FrameDecoder(layout)
+                begin = time.perf_counter()
+                count = sum(len(decoder.feed(piece)) for piece in pieces)
+                seconds[k] = min(seconds[k], time.perf_counter() - begin)
+                assert count + len(decoder.close()) == SAMPLES
+        theirs, ours = (SAMPLES / each for each in seconds)
+        stage, samples = f"decode {name}: {kind}", rounds * SAMPLES
+        measures.append(Measure(stage, samples, theirs, f"decode {own}", samples, ours))
+    return measures
+
+
 def machine() -> dict[str, str | int]:
     """Describe machine and software."""
     return {
@@ -298,7 +331,7 @@ def main() -> None:
         how = f"an hour in the pieces of a capture, a row a second, peak memory {peak_mb:.0f} MB"
         extra = {"peak_mb": peak_mb}
     else:
-        measures = throughput(rounds)
+        measures = throughput(rounds) + decode_of_others(rounds)
     if options.json:
         rows = [{**asdict(m), "ratio": m.ratio} for m in measures]
         print(json.dumps({"machine": machine(), "measures": rows, **extra}, indent=1))

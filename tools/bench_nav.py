@@ -126,7 +126,7 @@ def nav(rounds: int) -> Hour:
 
 def _write(path: Path) -> NDArray[np.float64]:
     """Write an hour of wire bytes; return the attitude at its start."""
-    chunks = list(simulate(SCENARIO, LAYOUT.interval_ns))
+    chunks = list(simulate(SCENARIO, LAYOUT))
     pulses = np.concatenate([chunk.pulses for chunk in chunks])
     first = pulses["counter"].copy()
     encoder = StreamEncoder(LAYOUT)
@@ -156,7 +156,7 @@ def _process(path: Path, q_nb: NDArray[np.float64]) -> float:
 
 def _period(path: Path) -> list[Records]:
     """Return the increments of the first two half turns, in the pieces of the capture."""
-    pieces, wanted = [], samples(SCENARIO, LAYOUT.interval_ns)
+    pieces, wanted = [], samples(SCENARIO, LAYOUT.interval)
     for increments in Capture(path, PROFILE).increments(_compensator(), lambda _: None):
         pieces.append(increments[:wanted])
         wanted -= len(pieces[-1])

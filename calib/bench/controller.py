@@ -51,7 +51,7 @@ from imudrv.records import INCREMENTS, Records
 from imudrv.service.loop import Service
 from imudrv.sinks.base import Batch
 from imudrv.units import NS_PER_S
-from imudrv.wire.layout import Layout
+from imudrv.wire.layout import Layout, SequenceKind
 
 REDRAW_S: Final = 0.2
 """Interval at which the screen is redrawn and keys are read, s."""
@@ -223,16 +223,20 @@ class SessionController:
                 self._conditions, self._conditions_ns = conditions, int(newest["elapsed_ns"])
                 if not self._is_unit_detected:
                     self._is_unit_detected = True
-                    self._check_unit(int(newest["counter"]))
+                    self._check_unit(int(newest["counter"]) // self._layout.counter_step)
                 events = engine.update_status(conditions)
         return events + engine.feed(batch.increments)
 
     def _check_unit(self, counter: int) -> None:
-        """Check the temperature of the unit when its first data arrive, and note whether it has restarted."""
+        """Check the temperature of the unit when its first data arrive, and note whether it has restarted.
+
+        Samples of a unit without a counter are numbered from 0 by each process: that shows no restart.
+        """
         session, degc = self._session, dict(self._conditions.temperature_degc)
         require_temperature(session, degc)
         newest = max((entry.counter for entry in session.entries if isinstance(entry, Counted)), default=-1)
-        session.append(UnitDetected(counter, counter < newest, degc))
+        is_counted = self._layout.sequence.kind is SequenceKind.COUNTER
+        session.append(UnitDetected(counter, is_counted and counter < newest, degc))
 
     def _apply_events(self, engine: Engine, events: Sequence[Event]) -> Finished | Aborted | None:
         """Journal events, begin and end recordings; return the event that ends the steps."""

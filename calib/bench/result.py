@@ -27,15 +27,16 @@ from calib.identification import (
 from calib.messages import english
 from calib.procedure.plan import verification
 from calib.procedure.schema import VERIFICATION, Procedure
-from imudrv.calibration import Calibration
+from imudrv.calibration import Calibration, coefficients
 from imudrv.errors import InputError
 from imudrv.files import atomic
+from imudrv.imu.compensation import Compensator
 from imudrv.imu.sequence import SampleCounts, SequenceTracker
 from imudrv.recording.reader import Recording
 from imudrv.records import Records
 from imudrv.site import Site
 from imudrv.wire.decoder import FrameDecoder
-from imudrv.wire.layout import Layout
+from imudrv.wire.layout import NARROW_BITS, Layout, SequenceKind
 
 _PUBLISHED_PERIOD: Final = 1 << 32
 """Period of the counter of published increments."""
@@ -43,6 +44,10 @@ _PUBLISHED_PERIOD: Final = 1 << 32
 
 _READS_PER_PIECE: Final = 1000
 """Reads of the port that are decoded together; a live read brings one sample."""
+_LATER: Final = 1000
+"""Samples by which the first one of a recording that can be decoded may follow the first one published."""
+_ROUNDING: Final = 1e-5
+"""Relative: intervals of a sample rate that is a ratio differ by 1 ns of 100 us or more."""
 
 
 class Result(NamedTuple):
@@ -68,7 +73,7 @@ class DecodedRecording(NamedTuple):
     pulses : Records
         Pulses.
     counter : ndarray of int64
-        Their counters, in the service's count.
+        Their numbers in the service's count, which is that of the engine's events.
     layout : Layout
         Of the recording.
     counts : SampleCounts
@@ -238,26 +243,51 @@ def _decode(attempt: Attempt) -> DecodedRecording:
     recording = Recording(attempt.recording)
     layout = recording.profile.layout()
     decoder, tracker = FrameDecoder(layout), SequenceTracker(layout)
-    pulses = [tracker.feed(decoder.feed(data)) for data in _wire(recording)]
+    pulses = [tracker.feed(decoder.feed(data, t_ns)) for data, t_ns in _wire(recording, layout)]
     pulses.append(tracker.feed(decoder.close()))
     samples = np.concatenate(pulses)
-    counter = samples["counter"]
+    if layout.sequence.kind is SequenceKind.COUNTER:
+        begin, number = _by_counter(recording, attempt, samples["counter"], layout)
+    else:
+        begin, number = 0, _by_increments(recording, attempt, samples, layout)
+    first, stop = np.searchsorted(number, [attempt.first_counter, attempt.last_counter + 1])
+    return DecodedRecording(samples[begin + first : begin + stop], number[first:stop], layout, tracker.counts)
+
+
+def _by_counter(
+    recording: Recording, attempt: Attempt, counter: NDArray[np.int64], layout: Layout
+) -> tuple[int, NDArray[np.int64]]:
+    """Return the first sample after the last restart of the unit, and the service's numbers from there on."""
+    step = layout.counter_step
     backward = np.flatnonzero(np.diff(counter) <= 0)  # the unit restarted before the attempt
     begin = int(backward[-1]) + 1 if len(backward) else 0
     counter = counter[begin:]
     if len(counter) and not begin:  # at a restart the service, too, begins with the unit's own number
-        counter = counter + _offset(recording, attempt, int(counter[0]), 1 << layout.sequence.bits)
-    first, stop = np.searchsorted(counter, [attempt.first_counter, attempt.last_counter + 1])
-    return DecodedRecording(
-        samples[begin + first : begin + stop], counter[first:stop], layout, tracker.counts
-    )
+        first = int(counter[0])
+        published = next((int(rows["counter"][0]) for rows in recording.increments()), first // step)
+        published += _multiple(attempt.last_counter - published, _PUBLISHED_PERIOD)
+        # The counter may have wrapped before the recording.
+        counter = counter + _multiple(step * published - first, 1 << layout.sequence.bits)
+    return begin, counter // step
 
 
-def _offset(recording: Recording, attempt: Attempt, first: int, period: int) -> int:
-    """Return the service's count minus the unit's counter, which may have wrapped before the recording."""
-    published = next((int(increments["counter"][0]) for increments in recording.increments()), first)
-    published += _multiple(attempt.last_counter - published, _PUBLISHED_PERIOD)
-    return _multiple(published - first, period)
+def _by_increments(
+    recording: Recording, attempt: Attempt, samples: Records, layout: Layout
+) -> NDArray[np.int64]:
+    """Return the service's numbers of samples that the unit does not number: those of equal increments."""
+    published, calibration = list(recording.increments()), recording.calibration
+    if not len(samples) or not published or calibration is None:
+        return np.zeros(0, np.int64)
+    theirs = np.concatenate(published)
+    compensator = Compensator(coefficients(calibration), layout)
+    own = np.concatenate([compensator.feed(samples), compensator.close()])
+    for later in range(min(_LATER, len(theirs))):
+        n = min(len(own), len(theirs) - later)
+        rows = theirs[later : later + n]
+        if all(np.allclose(own[name][:n], rows[name], _ROUNDING, 0.0) for name in ("dtheta_b", "dv_b")):
+            number = rows["counter"]
+            return number + _multiple(attempt.last_counter - int(number[-1]), _PUBLISHED_PERIOD)
+    return np.zeros(0, np.int64)
 
 
 def _multiple(difference: int, period: int) -> int:
@@ -283,8 +313,13 @@ def _missing(attempt: Attempt, decoded: DecodedRecording) -> str:
     return f"its recording does not cover counters {edges[longest] + 1}..{edges[longest + 1] - 1}"
 
 
-def _wire(recording: Recording) -> Iterator[bytes | Records]:
-    """Yield the wire data of a recording in pieces of many reads."""
+def _wire(recording: Recording, layout: Layout) -> Iterator[tuple[bytes | Records, int]]:
+    """Yield the wire data of a recording and their time of arrival; in large pieces where it is not used."""
+    sequence = layout.sequence
+    is_narrow = sequence.kind is SequenceKind.COUNTER and sequence.bits < NARROW_BITS
+    if is_narrow or sequence.kind is SequenceKind.NONE:
+        yield from ((arrival.data, arrival.t_ns) for arrival in recording.arrivals())
+        return
     arrivals = (arrival.data for arrival in recording.arrivals())
     while pieces := list(islice(arrivals, _READS_PER_PIECE)):
-        yield np.concatenate(pieces) if isinstance(pieces[0], np.ndarray) else b"".join(pieces)  # type: ignore[arg-type]
+        yield (np.concatenate(pieces) if isinstance(pieces[0], np.ndarray) else b"".join(pieces)), 0  # type: ignore[arg-type]

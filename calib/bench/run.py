@@ -22,11 +22,14 @@ from calib.bench.screen import OperatorScreen
 from calib.bench.session import Session
 from calib.bench.simulated_unit import SimulatedUnitProcess, is_rehearsal
 from calib.bench.state import JOURNAL, REPORT, WORKING_CERTIFICATE
+from calib.inputs import require_six_axes
 from calib.procedure.plan import load_file, predicted
 from calib.procedure.schema import Procedure
 from imudrv import profiles
+from imudrv.calibration import coefficients, read_calibration
 from imudrv.errors import InputError
 from imudrv.files import settings_file
+from imudrv.imu.compensation import require_sensors
 from imudrv.service.loop import Service
 from imudrv.service.runtime import SignalFlags
 from imudrv.service.settings import Settings
@@ -144,6 +147,7 @@ def conduct(session: Session, options: RunOptions, console: Console) -> int:
     plan = session.plan
     simulated = SimulatedUnitProcess(session.folder, options.speed) if options.is_rehearsal else None
     queue = QueueSink(QUEUE_LIMIT if simulated is not None and simulated.waits else None)
+    layout = profiles.load(plan.profile.name).layout()
     settings = Settings(
         port=options.port or plan.port,
         profile=plan.profile.name,
@@ -157,7 +161,7 @@ def conduct(session: Session, options: RunOptions, console: Console) -> int:
         lambda text: queue.put_message(text.partition(" ")[2]),
         [queue],
         in_real_time=simulated is None,
-        history=History(),
+        history=History(counter_step=layout.counter_step),
         signals=signals,
     )
 
@@ -167,7 +171,7 @@ def conduct(session: Session, options: RunOptions, console: Console) -> int:
 
     controller = SessionController(
         session,
-        profiles.load(plan.profile.name).layout(),
+        layout,
         service,
         queue,
         OperatorScreen(console),
@@ -217,10 +221,16 @@ def _create(options: RunOptions, console: Console) -> Session:
     procedure = load_file(name)
     port, calibration, site, profile = options.port, options.calibration, options.site, options.profile
     if options.is_rehearsal:
-        port, calibration, site = SimulatedUnitProcess(folder, options.speed).make(procedure.model)
         profile = profile or REHEARSAL_PROFILE
-    if port is None or profile is None or calibration is None or site is None:
-        raise InputError("a new session: expected --port, --profile, --calibration and --site")
+    incomplete = InputError("a new session: expected --port, --profile, --calibration and --site")
+    if profile is None:
+        raise incomplete
+    layout = require_six_axes(profiles.load(profile).layout())
+    if options.is_rehearsal:
+        port, calibration, site = SimulatedUnitProcess(folder, options.speed).make(layout)
+    if port is None or calibration is None or site is None:
+        raise incomplete
+    require_sensors(coefficients(read_calibration(calibration)), layout)
     place = settings_file.read_file(site, Site)
     worst_mm = float(predicted(procedure.model, place.model).differences_sigma.max()) / MM
     expected = f"session {folder}: expected accuracy of the differences: {worst_mm:.3f} mm (1 sigma)"

@@ -85,6 +85,7 @@ def technician_scenario(
     *,
     seed: int = 1,
     calibration: Calibration | None = None,
+    unit: Calibration = NOMINAL,
 ) -> Scenario:
     """Return the scenario of a procedure carried out by hand.
 
@@ -98,6 +99,8 @@ def technician_scenario(
         Random seed of the unit's errors, its lever arms, and the technician's hands.
     calibration : Calibration, optional
         Certificate of the unit; its `size_effect` is the truth. Default: `true_calibration` of the seed.
+    unit : Calibration
+        The unit whose lever arms are drawn by default.
 
     Returns
     -------
@@ -117,7 +120,7 @@ def technician_scenario(
             f"got {', '.join(m.step_id for m in mistakes)}"
         )
     rng = np.random.default_rng(seed)
-    truth = _draw_lever_arms(rng) if calibration is None else calibration
+    truth = _draw_lever_arms(rng, unit) if calibration is None else calibration
     hands = _MotionScript(procedure, rng)
     for step in procedure.steps:
         hands.do(step, kinds.get(step.id))
@@ -145,17 +148,17 @@ def technician_scenario(
     )
 
 
-def true_calibration(seed: int) -> Calibration:
-    """Return the nominal unit with random lever arms, as `technician_scenario` simulates it."""
-    return _draw_lever_arms(np.random.default_rng(seed))
+def true_calibration(seed: int, unit: Calibration = NOMINAL) -> Calibration:
+    """Return a unit with random lever arms, as `technician_scenario` simulates it."""
+    return _draw_lever_arms(np.random.default_rng(seed), unit)
 
 
-def _draw_lever_arms(rng: np.random.Generator) -> Calibration:
-    """Draw the nominal unit's lever arms, in gauge centroid."""
+def _draw_lever_arms(rng: np.random.Generator, unit: Calibration) -> Calibration:
+    """Draw the lever arms of a unit, in gauge centroid."""
     r_mm = np.round(rng.normal(0.0, ARM_MM, (3, 3)), 3)
     r_mm[2] = -r_mm[0] - r_mm[1]
     size_effect = SizeEffect(r_mm=sensing_points(np.round(r_mm, 3)), gauge="centroid")
-    return NOMINAL.model_copy(update={"serial_number": "rehearsal", "size_effect": size_effect})
+    return unit.model_copy(update={"serial_number": "rehearsal", "size_effect": size_effect})
 
 
 class _MotionScript:

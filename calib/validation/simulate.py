@@ -103,7 +103,9 @@ def subject(unit: Unit, seed: int, *, procedure: Sequence[str] = PROCEDURE) -> S
 def true_calibration(unit: Unit, seed: int) -> Calibration:
     """Return the calibration of the unit that a seed draws, which would leave no error."""
     nominal = unit.calibration or NOMINAL
-    drawn = draw_true_unit(scenarios.load(PROCEDURE[0]).model_copy(update={"unit": unit, "seed": seed}))
+    drawn = draw_true_unit(
+        scenarios.load(PROCEDURE[0]).model_copy(update={"unit": unit, "seed": seed}), LAYOUT
+    )
     return nominal.model_copy(
         update={
             "gyro": Gyro(
@@ -292,7 +294,7 @@ def _rows(matrix: Array) -> Any:
 
 def simulated_pulses(run: Scenario) -> Iterator[Records]:
     """Yield the pulses of a scenario, piece by piece."""
-    for chunk in simulate(run, LAYOUT.interval_ns):
+    for chunk in simulate(run, LAYOUT):
         chunk.pulses["flags"] = Flag.VALID
         yield chunk.pulses
 

@@ -49,7 +49,7 @@ def _record(arguments: argparse.Namespace) -> None:
         raise InputError("--speed, --link: expected with --port; a capture has no speed")
     layout = profiles.load(arguments.profile).layout()
     scenario = scenarios.load(arguments.scenario)
-    samples = scenarios.samples(scenario, layout.interval_ns)
+    samples = scenarios.samples(scenario, layout.interval)
     if arguments.truth is not None and arguments.truth.suffix != ".npz":
         raise InputError(f"--truth {arguments.truth}: expected a name ending in .npz")
     for output in filter(None, (arguments.output, arguments.truth)):

@@ -102,6 +102,7 @@ class Service:
         clock_watch: ClockWatch | None = None,
     ) -> None:
         self._settings, self._clock = settings, clock
+        self._in_real_time = in_real_time
         self._clock_watch = clock_watch or ClockWatch()
         self._version = version("imu50")  # reads files: not in the loop
         self._profile_file = profiles.load_file(settings.profile)
@@ -235,10 +236,13 @@ class Service:
         return self._recordings.request(path, since)
 
     def _process(self, arrival: Arrival) -> None:
+        read_ns = arrival.t_ns
+        if not self._in_real_time:
+            arrival = arrival._replace(t_ns=0)  # when it came tells nothing about its samples
         self._recordings.arrived(arrival)
         self._pipeline.clock.follow(arrival.timebase)
         output = self._pipeline.feed(arrival.data, arrival.t_ns)
-        self._publish(output, arrival.t_ns)
+        self._publish(output, read_ns)
         self._port.decoded(arrival, len(output.pulses))
 
     def _publish(self, output: PipelineOutput, arrival_ns: int) -> None:

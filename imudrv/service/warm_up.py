@@ -21,7 +21,7 @@ def warm_up(profile: Profile, calibration: Calibration, rate_filter: RateFilterN
     """Send made-up samples through every stage, including a replacement of the calibration."""
     layout = profile.layout()
     pulses = np.zeros(_SAMPLES, PULSES)
-    pulses["counter"] = np.arange(_SAMPLES)
+    pulses["counter"] = layout.counter_step * np.arange(_SAMPLES)
     pulses["temperature_degc"] = 35.0
     pipeline = Pipeline(profile, coefficients(calibration), rate_filter)
     wire = CanEncoder(layout).encode(pulses) if layout.can else StreamEncoder(layout).encode(pulses).tobytes()

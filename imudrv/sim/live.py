@@ -255,10 +255,10 @@ def play(
             if due:
                 last_ns = due.last_ns
                 latest_ns = max(latest_ns, -pace.left_ns(due.first_ns))
-        whole = samples(scenario, layout.interval_ns)
+        whole = samples(scenario, layout.interval)
         line.finish()
     return Played(
-        last_ns // layout.interval_ns if stop.is_set() else whole,
+        round(last_ns / layout.interval) if stop.is_set() else whole,
         line.sent,
         line.undelivered,
         "messages" if layout.can else "bytes",

@@ -94,7 +94,7 @@ class _Encoder:
         """Encode the messages of kind `k`, one a row."""
         message, kind = self._layout.messages[k], self._kinds[k]
         rows = np.zeros((samples.size, message.length), np.uint8)
-        numbers = [self._number(field, samples, counts, at) for field in message.fields]
+        numbers = [self._number(field, samples, counts) for field in message.fields]
         _write_fields(rows, _columns(numbers, samples.size), self._fields[k])
         self._write_multiplexed(rows, message, samples, counts, at)
         _finish_rows(rows, kind, self._constants, self._checks)
@@ -114,15 +114,15 @@ class _Encoder:
                 _write_fields(rows, turn[:, None], np.array([selector], FIELD))
             for one in some:
                 there = np.flatnonzero((turn % modulo if modulo else turn) == one.value)
-                number = self._number(one.field, samples, counts, at)[there]
+                number = self._number(one.field, samples, counts)[there]
                 part = rows[there]
                 _write_fields(part, number[:, None], np.array([one.field], FIELD))
                 rows[there] = part
 
-    def _number(self, field: Field, samples: Records, counts: list[Floats], at: Ints) -> Ints:
+    def _number(self, field: Field, samples: Records, counts: list[Floats]) -> Ints:
         """Return a number of each sample as it is on the wire; a floating-point one as its bits."""
         if field.target == SEQUENCE:
-            return self._position(field, samples, at)
+            return self._position(field, samples)
         if field.target == STATUS:
             status = samples["status"].astype(np.int64) >> field.place
             if len({f.place for m in self._layout.messages for f in m.fields if f.target == STATUS}) == 1:
@@ -145,12 +145,12 @@ class _Encoder:
             self._require_room(samples, whole, _AXES[field.target - GYRO], field.bits, is_signed=field.signed)
         return whole
 
-    def _position(self, field: Field, samples: Records, at: Ints) -> Ints:
+    def _position(self, field: Field, samples: Records) -> Ints:
         """Return the counter of the samples, or their time."""
         if self._layout.sequence.kind is SequenceKind.COUNTER:
             counter: Ints = samples["counter"]
             return counter
-        ticks = np.rint(at * float(self._layout.sequence.step))
+        ticks = np.rint(samples["counter"] * float(self._layout.sequence.step))
         return _bits(ticks / field.ticks, field.size) if field.is_float else ticks.astype(np.int64)
 
     def _require_room(

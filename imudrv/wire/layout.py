@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from fractions import Fraction
 from functools import cached_property
+from itertools import takewhile
 from typing import Final, NamedTuple
 
 SEQUENCE: Final = 0
@@ -207,6 +208,12 @@ class Message(NamedTuple):
     can_id: int = 0
     can_mask: int = 0xFFFFFFFF
     every: int = 1
+
+    @property
+    def header(self) -> bytes:
+        """The bytes at the beginning that never change."""
+        values = dict(self.constants)
+        return bytes(values[k] for k in takewhile(values.__contains__, range(self.length)))
 
     @property
     def plain_check(self) -> Check | None:

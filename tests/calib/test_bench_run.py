@@ -161,6 +161,35 @@ def test_a_rehearsal_in_fast_time_is_not_reported_as_a_wrong_rate(undisturbed: t
     assert "samples/s" not in said + (folder / JOURNAL).read_text()
 
 
+@pytest.mark.parametrize(
+    "profile",
+    [
+        "kvh1775",  # floating point, a counter of 7 bits
+        "hg4930",  # no counter
+        "ilabs-ga-200",  # rates, a counter in steps of 10
+        "sbg-imu-short",  # a time
+    ],
+)
+def test_units_of_other_makers_give_arms_as_good_from_their_recordings(profile: str, tmp_path: Path) -> None:
+    (tmp_path / "short.yaml").write_text(PROCEDURE)
+    options = ["--rehearse", "--speed", "max", "--profile", profile, "--procedure", "short.yaml"]
+    calib = [sys.executable, "-m", "calib"]
+    for command in (["run", *options, "--session", "session"], ["verify", "session"]):
+        process = subprocess.Popen(
+            [*calib, *command],
+            cwd=tmp_path,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        said = ended(process)
+    assert "the recordings give the certificate, digit for digit" in said
+    check_true(tmp_path / "session")
+    certificate = read_calibration(tmp_path / "session" / "certificate.yaml")
+    assert certificate.gyro.scale == certificate.accelerometer.scale == (1.0, 1.0, 1.0)
+
+
 def test_the_operator_sees_that_the_unit_sends_no_frame_of_the_profile(tmp_path: Path) -> None:
     write_calibration(tmp_path / "unit.yaml", NOMINAL)
     settings_file.write(tmp_path / "site.yaml", BENCH)

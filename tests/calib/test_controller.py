@@ -141,7 +141,7 @@ def performed(scenario: Scenario) -> list[Batch]:
     """Samples of a scenario, in pieces of a fifth of a second."""
     compensator = Compensator(coefficients(NOMINAL.model_copy(update={"size_effect": None})), LAYOUT)
     made = []
-    for chunk in simulate(scenario, LAYOUT.interval_ns):
+    for chunk in simulate(scenario, LAYOUT):
         for begin in range(0, len(chunk.pulses), 200):
             pulses = chunk.pulses[begin : begin + 200]
             increments = compensator.feed(pulses)

@@ -77,7 +77,7 @@ def samples_of(scenario: Scenario) -> Records:
     assert calibration is not None
     plain: Coefficients = coefficients(calibration.model_copy(update={"size_effect": None}))
     compensator = Compensator(plain, LAYOUT, "centred")
-    samples = np.concatenate([compensator.feed(c.pulses) for c in simulate(scenario, LAYOUT.interval_ns)])
+    samples = np.concatenate([compensator.feed(c.pulses) for c in simulate(scenario, LAYOUT)])
     for unplug in scenario.faults.unplugs:
         out = (samples["t_ns"] > unplug.at_s * 1e9) & (
             samples["t_ns"] <= (unplug.at_s + unplug.duration_s) * 1e9

@@ -165,7 +165,7 @@ def test_any_pieces_give_the_same_bits(who: SimulatedUnit) -> None:
 
 
 def _pulses(of: Scenario) -> Iterator[Records]:
-    for chunk in simulate(of, LAYOUT.interval_ns):
+    for chunk in simulate(of, LAYOUT):
         chunk.pulses["flags"] = Flag.VALID
         yield chunk.pulses
 

@@ -4,6 +4,7 @@ from typing import Any
 
 import pytest
 
+from imudrv import profiles
 from imudrv.calibration import Calibration
 from imudrv.errors import FaultyFileError, InputError
 from imudrv.files.settings_file import write
@@ -23,7 +24,7 @@ motion:
 @pytest.mark.parametrize("name", shipped())
 def test_a_shipped_scenario_loads_and_runs(name: str) -> None:
     scenario = load(name)
-    chunk = next(simulate(scenario, 1_000_000, 10))
+    chunk = next(simulate(scenario, profiles.load("imu50-rs422").layout(), 10))
     assert chunk.pulses.size == 10
     up = "xyz".index(scenario.start.pose[0])
     # g for 10 ms at 2000 pulses per m/s; noise and the dither of the arm are a pulse or two

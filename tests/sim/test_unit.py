@@ -1,19 +1,24 @@
 from collections.abc import Callable
+from dataclasses import replace
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
 import pytest
 
+from imudrv import profiles
 from imudrv.errors import InputError
 from imudrv.imu.coefficients import Coefficients
 from imudrv.nav.earth import earth_rate_n
 from imudrv.sim.scenario import NOMINAL, Scenario
-from imudrv.sim.unit import STATUS_OVERFLOW, STATUS_WARM_UP, Chunk, draw_true_unit, simulate
+from imudrv.sim.unit import Chunk, draw_true_unit, simulate
 from imudrv.units import ARCSEC, DEG, DEG_PER_H, DEG_PER_SQRT_H, PPM, UG, URAD
 
 Make = Callable[..., Scenario]
 
 MS = 1_000_000
+LAYOUT = profiles.load("imu50-rs422").layout()
+STATUS_WARM_UP, STATUS_OVERFLOW = 1 << 0, 1 << 10  # ICD, section 2
 REST = {"rest": {"duration_s": 2.0}}
 TURN = {"rotate": {"angle_deg": 90.0, "duration_s": 1.5, "axis_tilt_mrad": [3.0, 0.0]}}
 ROCK = {
@@ -55,7 +60,7 @@ FINE = {
 
 
 def run(scenario: Scenario, interval_ns: int = MS, chunk: int = 65_536) -> Chunk:
-    chunks = list(simulate(scenario, interval_ns, chunk))
+    chunks = list(simulate(scenario, replace(LAYOUT, interval=Fraction(interval_ns)), chunk))
     return Chunk(np.concatenate([c.pulses for c in chunks]), np.concatenate([c.truth for c in chunks]))
 
 
@@ -85,7 +90,7 @@ def test_pulses_converted_by_the_calibration_are_the_truth(scenario: Make) -> No
             start={"pivot_offset_mm": [40, 30, 20]},
         )
     )
-    unit = draw_true_unit(scenario(REST, unit={"calibration": FINE}))
+    unit = draw_true_unit(scenario(REST, unit={"calibration": FINE}), LAYOUT)
     tau, warmer = 1e-3, got.pulses["temperature_degc"][:, :1] - 35.0
     k_g = np.array([0.001, 0.002, 0.0015]) * ARCSEC * (1 + warmer * np.array([10, -20, 30]) * PPM)
     b_g = (np.array([10, -20, 30]) + warmer * np.array([1, 2, -1])) * DEG_PER_H
@@ -103,7 +108,7 @@ def test_pulses_converted_by_the_calibration_are_the_truth(scenario: Make) -> No
 
 def test_the_fraction_of_a_pulse_is_never_lost(scenario: Make) -> None:
     coarse = scenario(REST, TURN, REST)
-    got, unit = run(coarse), draw_true_unit(coarse)
+    got, unit = run(coarse), draw_true_unit(coarse, LAYOUT)
     total = np.cumsum(got.pulses["gyro"], axis=0)
     exact = np.cumsum(got.truth["dtheta_b"] / unit.gyro_scale, axis=0)
     assert (
@@ -142,7 +147,7 @@ def test_any_chunk_gives_the_same_bits(scenario: Make) -> None:
 def test_noise_is_a_random_walk_of_the_stated_size(scenario: Make) -> None:
     noise = {"arw_deg_per_sqrt_h": 0.3, "vrw_m_s_per_sqrt_h": 0.6}
     noisy = scenario({"rest": {"duration_s": 100.0}}, unit={"calibration": FINE, "noise": noise})
-    pulses, unit = run(noisy).pulses, draw_true_unit(noisy)
+    pulses, unit = run(noisy).pulses, draw_true_unit(noisy, LAYOUT)
     gyro = pulses["gyro"] * unit.gyro_scale
     speed = pulses["accelerometer"] / unit.accelerometer_scale
     for samples in (1, 100):
@@ -166,7 +171,7 @@ def test_dither_of_the_case_rectifies_to_minus_half_its_rate_squared(scenario: M
         {"rest": {"duration_s": 1.0}}, unit={"calibration": {**FINE, "temperature": None}, "dither": dither}
     )
     still = scenario({"rest": {"duration_s": 1.0}}, unit={"calibration": {**FINE, "temperature": None}})
-    unit = draw_true_unit(still)
+    unit = draw_true_unit(still, LAYOUT)
     change = (run(shaking).pulses["accelerometer"] - run(still).pulses["accelerometer"]).sum(
         axis=0
     ) / unit.accelerometer_scale
@@ -276,8 +281,10 @@ def test_residuals_have_their_sigma_and_nothing_else_changes(scenario: Make) -> 
         "accelerometer_scale_ppm": 20.0,
         "accelerometer_misalignment_urad": 40.0,
     }
-    units = [draw_true_unit(scenario(REST, seed=seed, unit={"residuals": sigmas})) for seed in range(200)]
-    exact = draw_true_unit(scenario(REST))
+    units = [
+        draw_true_unit(scenario(REST, seed=seed, unit={"residuals": sigmas}), LAYOUT) for seed in range(200)
+    ]
+    exact = draw_true_unit(scenario(REST), LAYOUT)
 
     def sigma(of: Callable[[Coefficients], Any]) -> float:
         return float(np.std([of(u) - of(exact) for u in units]))
@@ -297,7 +304,7 @@ def test_residuals_have_their_sigma_and_nothing_else_changes(scenario: Make) -> 
 
 
 def test_without_a_calibration_the_unit_is_the_nominal_one(scenario: Make) -> None:
-    unit = draw_true_unit(scenario(REST))
+    unit = draw_true_unit(scenario(REST), LAYOUT)
     assert NOMINAL.size_effect is not None
     np.testing.assert_array_equal(unit.r_b, NOMINAL.size_effect.r_m)
     np.testing.assert_array_equal(unit.gyro_scale, np.full(3, 0.5 * ARCSEC))
@@ -319,4 +326,4 @@ def test_an_invalid_interval_or_chunk_is_refused(
     scenario: Make, interval_ns: int, chunk: int, message: str
 ) -> None:
     with pytest.raises(InputError, match=message):
-        next(simulate(scenario(REST), interval_ns, chunk))
+        next(simulate(scenario(REST), replace(LAYOUT, interval=Fraction(interval_ns)), chunk))

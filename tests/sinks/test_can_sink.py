@@ -1,3 +1,4 @@
+import re
 import threading
 from itertools import count
 from pathlib import Path
@@ -176,3 +177,29 @@ def test_an_absent_or_failing_bus_is_reported_and_reopened(batch, wait_for, monk
 def test_an_impossible_gateway_is_refused(url: str, told: str) -> None:
     with pytest.raises(InputError, match=told):
         CanSink(url, SERIAL)
+
+
+@pytest.mark.parametrize(
+    ("unit", "profile", "found"),
+    [
+        (
+            "kvh1775",
+            "imu50-can",
+            "gyro: expected a profile for other units than pulses, as kvh1775 sends them",
+        ),
+        (
+            "exail-asterix",
+            "openimu-j1939",
+            "accelerometer: expected a profile for the axes that exail-asterix has",
+        ),
+    ],
+)
+def test_a_profile_that_cannot_carry_the_units_numbers_is_refused_with_the_reason(
+    unit: str, profile: str, found: str, tmp_path: Path
+) -> None:
+    layout = profiles.load(unit).layout()
+    outgoing = tmp_path / "outgoing.yaml"  # at the unit's rate, so that only the numbers differ
+    rate = f"sample_rate_hz: {1e9 / layout.interval_ns:g}".encode()
+    outgoing.write_bytes(re.sub(rb"sample_rate_hz: \d+", rate, profiles.content(profile)))
+    with pytest.raises(InputError, match=found):
+        CanSink(f"can://virtual/refused?profile={outgoing}", layout)

@@ -141,7 +141,7 @@ def test_damage_loses_exactly_the_damaged_frames_in_any_chunks(reference, axis):
     frames = np.frombuffer(raw, np.uint8).reshape(-1, LENGTH)
     kinds = StreamRates.model_fields
     line = StreamFaults(
-        Faults(stream=StreamRates(**dict.fromkeys(kinds, 0.02 / len(kinds)))), HEADER, seed=11
+        Faults(stream=StreamRates(**dict.fromkeys(kinds, 0.02 / len(kinds)))), [(LENGTH, HEADER)], seed=11
     )
     data, damage = line.apply(frames, np.arange(len(frames)))
     # The first and the last frame frame the account: what is lost outside of them no counter tells.
