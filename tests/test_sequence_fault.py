@@ -96,14 +96,14 @@ def test_a_capture_without_frames_says_what_was_seen_and_which_profile_fits(
         (
             "kvh1775",
             [100],
-            "1 gaps of unknown length, counted with the smallest: each may be 128 longer",
+            "1 gap of unknown length, counted with the smallest: or 128 samples more, any number of times",
         ),
         (
             "kvh1775",
             [100, 300],
-            "2 gaps of unknown length, counted with the smallest: each may be 128 longer",
+            "2 gaps of unknown length, counted with the smallest: or 128 samples more, any number of times",
         ),
-        ("hg4930", [100], "1 gaps of unknown length, counted with the smallest: each may be 1 longer"),
+        ("hg4930", [100], "1 gap of unknown length: the unit sends no counter"),
         ("kvh1775", [], ""),
         ("imu50-rs422", [100], ""),
     ],

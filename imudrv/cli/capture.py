@@ -7,6 +7,7 @@ from pathlib import Path
 from imudrv.capture import Capture
 from imudrv.cli.arguments import add_profile, message_stream
 from imudrv.terminal import BAD_INPUT, OK
+from imudrv.wire.layout import Layout, SequenceKind
 
 
 def add_capture(parser: argparse.ArgumentParser) -> None:
@@ -33,12 +34,7 @@ def print_losses(capture: Capture, output: Path) -> int:
     counts = capture.tracker.counts
     print(f"  {counts}", file=stream)
     if counts.unknown_gaps:
-        a_round = float(capture.layout.samples_a_round)
-        print(
-            f"  {counts.unknown_gaps} gaps of unknown length, counted with the smallest: each may be {a_round:g} "
-            "longer, any number of times, for there are no times of arrival",
-            file=stream,
-        )
+        print(f"  {_unknown_gaps(counts.unknown_gaps, capture.layout)}", file=stream)
     for reason, rejected in sorted(capture.rejected.items()):
         name = reason.name.lower().replace("_", " ")
         first = ", ".join(map(str, rejected.first))
@@ -53,3 +49,14 @@ def print_losses(capture: Capture, output: Path) -> int:
         print(f"error: {capture.path}: {fault}", file=sys.stderr)
         return BAD_INPUT
     return OK
+
+
+def _unknown_gaps(count: int, layout: Layout) -> str:
+    """Say how long the gaps may be whose length neither a counter nor a time of arrival tells."""
+    gaps = "1 gap of unknown length" if count == 1 else f"{count} gaps of unknown length"
+    if layout.sequence.kind is SequenceKind.NONE:
+        return f"{gaps}: the unit sends no counter, and the capture has no times of arrival"
+    return (
+        f"{gaps}, counted with the smallest: or {float(layout.samples_a_round):g} samples more, any number of "
+        "times, for the capture has no times of arrival"
+    )

@@ -135,8 +135,8 @@ class Compensator:
         Returns
         -------
         ndarray of INCREMENTS
-            Those that are ready; `t_ns` is the time by the counter, `elapsed_ns` of the pulses. NaN for a body
-            axis that an axis missing in the unit is a part of.
+            Those that are ready; `t_ns` is the time by the counter, `elapsed_ns` of the pulses. NaN for a
+            body axis that an axis missing in the unit is a part of.
         """
         if self._missing:
             pulses = pulses.copy()
