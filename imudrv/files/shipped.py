@@ -12,7 +12,7 @@ def names(folder: Path) -> list[str]:
     return sorted(path.stem for path in folder.glob("*.yaml"))
 
 
-def find(kind: str, name_or_path: str | os.PathLike[str], folder: Path, listed_by: str = "") -> Path:
+def find(kind: str, name_or_path: str | os.PathLike[str], folder: Path, known: str = "") -> Path:
     """Return the path of a file.
 
     Parameters
@@ -23,8 +23,8 @@ def find(kind: str, name_or_path: str | os.PathLike[str], folder: Path, listed_b
         Name of a file in the folder, or path of any file.
     folder : Path
         Folder of the package.
-    listed_by : str, optional
-        Command that lists the files of the folder, for messages.
+    known : str, optional
+        What is in the folder, for messages; otherwise all names.
 
     Returns
     -------
@@ -36,15 +36,14 @@ def find(kind: str, name_or_path: str | os.PathLike[str], folder: Path, listed_b
         It is neither.
     """
     name = os.fspath(name_or_path)
-    known = names(folder)
-    if name in known:
+    shipped = names(folder)
+    if name in shipped:
         return folder / f"{name}.yaml"
     if not Path(name).exists():
-        near = difflib.get_close_matches(name, known, 1)
+        near = difflib.get_close_matches(name, shipped, 1)
         hint = f"; did you mean {near[0]}?" if near else ""
         raise InputError(
-            f"{kind} {name!r}: expected one of {', '.join(known)}"
-            f"{f' (`{listed_by}` lists them)' if listed_by else ''}, "
+            f"{kind} {name!r}: expected {known or 'one of ' + ', '.join(shipped)}, "
             f"or the path of a {kind} file; there is no such file{hint}"
         )
     return Path(name)

@@ -59,4 +59,5 @@ def content(name_or_path: str | os.PathLike[str]) -> bytes:
 
 
 def _find(name_or_path: str | os.PathLike[str]) -> Path:
-    return shipped_files.find("profile", name_or_path, _FOLDER, listed_by="imudrv profiles")
+    known = f"{', '.join(OWN)}, another one that `imudrv profiles` lists"
+    return shipped_files.find("profile", name_or_path, _FOLDER, known)
