@@ -229,3 +229,11 @@ def test_intervals_of_a_rate_that_is_a_ratio_add_up_exactly(profile: str) -> Non
     # 1e6 samples of 5 / 4096 s are 1 220 703 125 us; a running total gives no increment for its first sample.
     first_ns = 1_220_703 if layout.totals else 0
     assert total_ns == 1_220_703_125_000 - first_ns
+
+
+@pytest.mark.parametrize("profile", ["fog-fg333", "exail-asterix"])
+def test_without_all_gyros_or_any_accelerometer_no_size_effect_is_compensated(profile: str) -> None:
+    calibration = nominal(profiles.load(profile).layout())
+    assert calibration.size_effect is not None
+    increments, _ = driven(profile, scenario(calibration, ROCKING), calibration)
+    assert not np.any(increments["flags"] & Flag.SIZE_EFFECT)

@@ -160,6 +160,22 @@ def test_imr_refuses_an_increment_that_it_cannot_hold(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["run.mcap"]
 
 
+def test_axes_that_a_unit_lacks_are_no_numbers_in_ros2_and_have_no_place_in_imr(tmp_path: Path) -> None:
+    increments = samples()[:5]
+    increments["dtheta_b"][:, 1:] = np.nan
+    increments["dv_b"] = np.nan
+    recording = record(tmp_path / "run.mcap", "fog-fg333", [], increments)
+    with pytest.raises(InputError, match=r"angle increments of all three axes.* export to csv or npz"):
+        export(recording, "imr", tmp_path / "out.imr")
+    reader = pytest.importorskip("mcap_ros2.reader")
+    export(recording, "ros2", tmp_path / "ros2.mcap")
+    for message in reader.read_ros2_messages(str(tmp_path / "ros2.mcap"), log_time_order=False):
+        imu = message.ros_msg
+        assert not np.isnan(imu.angular_velocity.x)
+        assert np.isnan([imu.angular_velocity.y, imu.angular_velocity.z]).all()
+        assert (imu.angular_velocity_covariance[0], imu.linear_acceleration_covariance[0]) == (0, -1)
+
+
 def test_ros2_has_rates_over_each_samples_own_interval(recorded: Recording, tmp_path: Path) -> None:
     reader = pytest.importorskip("mcap_ros2.reader")
     path = tmp_path / "ros2.mcap"

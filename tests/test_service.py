@@ -683,7 +683,7 @@ def test_a_unit_of_another_maker_is_served_and_healthy(profile: str, tmp_path: P
         assert status["unit_status"]["faults"] == []
         up = status["last"]["dv_b"][2]
         if any(load(profile).layout().accelerometer.axes):
-            # At rest, g for a sample; the dither shakes the case by 1 m/s^2 at 1 kHz. Wrong units: a factor of 10.
+            # At rest, g for a sample; dither shakes the case by 1 m/s^2 at 1 kHz. Other units: factor 10.
             assert up == pytest.approx(9.79 / second, rel=0.3)
         else:
             assert up is None or np.isnan(up)

@@ -50,9 +50,11 @@ def run(arguments: argparse.Namespace) -> int:
             rows.write(increment_columns(increments))
     code = print_losses(capture, arguments.output)
     stream = message_stream(arguments.output)
-    size_effect = (
-        "compensated" if calibration.size_effect else "not compensated: the calibration has no sensing points"
-    )
+    size_effect = "compensated"
+    if not calibration.size_effect:
+        size_effect = "not compensated: the calibration has no sensing points"
+    elif not compensator.has_size_effect:
+        size_effect = f"not compensated: {capture.layout.name} lacks axes"
     print(f"  unit {calibration.serial_number}, {origin}", file=stream)
     print(
         f"  size effect {size_effect}; rate filter {arguments.rate_filter}, delay {compensator.lag} samples",

@@ -104,7 +104,7 @@ class Compensator:
     ) -> None:
         require_sensors(coefficients, layout)
         gyro, accelerometer = layout.missing_axes
-        if gyro:
+        if gyro or len(accelerometer) == 3:
             coefficients = replace(coefficients, r_b=None)  # the size effect needs all angular rates
         self._missing = [
             (name, axes, out, C[:, axes].any(axis=1))

@@ -1,5 +1,6 @@
 """Export to sensor_msgs/Imu in an MCAP file for ROS 2."""
 
+from math import isnan
 from pathlib import Path
 from typing import Any, Final
 
@@ -89,7 +90,12 @@ def _imu_message(t_ns: int, rate: list[float], force: list[float]) -> dict[str, 
         "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
         "orientation_covariance": [-1.0] + [0.0] * 8,  # there is no orientation
         "angular_velocity": dict(zip("xyz", rate, strict=True)),
-        "angular_velocity_covariance": [0.0] * 9,  # not known
+        "angular_velocity_covariance": _covariance(rate),
         "linear_acceleration": dict(zip("xyz", force, strict=True)),
-        "linear_acceleration_covariance": [0.0] * 9,
+        "linear_acceleration_covariance": _covariance(force),
     }
+
+
+def _covariance(values: list[float]) -> list[float]:
+    """Return a covariance that is not known: 0, or -1 first for a sensor that the unit lacks."""
+    return [-1.0 if all(map(isnan, values)) else 0.0] + [0.0] * 8

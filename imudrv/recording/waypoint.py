@@ -98,6 +98,11 @@ class _Rounding:
         self._remainder = np.zeros(3)
 
     def feed(self, values: NDArray[np.float64], increments: Records) -> NDArray[np.float64]:
+        if np.isnan(values).any():
+            raise InputError(
+                f"expected {self._name} increments of all three axes, as the format has no place for an "
+                "absent one, got those of a unit that lacks some; export to csv or npz"
+            )
         sums = self._remainder + np.cumsum(values / self._scale, axis=0)
         whole = np.rint(sums)
         self._remainder = sums[-1] - whole[-1]

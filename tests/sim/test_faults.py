@@ -234,3 +234,28 @@ def test_a_bus_falls_silent_too(faults: Callable[..., Faults]) -> None:
     )
     np.testing.assert_array_equal(got["id"], np.arange(10, 30))
     np.testing.assert_array_equal(damage.hit, np.arange(30) < 10)
+
+
+def test_each_message_of_a_sample_has_its_own_faults(faults: Callable[..., Faults]) -> None:
+    """Three messages a sample: rates are per message, and the bytes of the others are as they were."""
+    kinds = [(11, b"\x55\x51"), (9, b"\x55\x52"), (5, b"\x56")]
+    n = 2000
+    rows = np.random.default_rng(1).integers(0, 256, (n, 25), np.uint8)
+    t_ns = np.repeat(times(n), 3)
+    whole = faults(stream={"frame_lost": 0.1})
+    stream, damage = StreamFaults(whole, kinds, 5).apply(rows, t_ns)
+    assert damage.hit.shape == (3 * n,)
+    for k, (length, _) in enumerate(kinds):
+        lost = damage.hit[k::3]
+        assert abs(lost.mean() - 0.1) < 4 * np.sqrt(0.1 * 0.9 / n)  # four sigma
+        np.testing.assert_array_equal(damage.size[k::3], np.where(lost, 0, length))
+    starts = np.array([0, 11, 20])
+    kept = [
+        rows[i // 3, starts[i % 3] : starts[i % 3] + kinds[i % 3][0]].tobytes()
+        for i in np.flatnonzero(~damage.hit)
+    ]
+    assert stream == b"".join(kept)
+    # any pieces, the same faults
+    line = StreamFaults(whole, kinds, 5)
+    pieces = [line.apply(rows[a:b], t_ns[3 * a : 3 * b])[0] for a, b in ((0, 7), (7, 1000), (1000, n))]
+    assert b"".join(pieces) == stream

@@ -13,6 +13,7 @@ from imudrv.nav.earth import earth_rate_n
 from imudrv.sim.scenario import NOMINAL, Scenario
 from imudrv.sim.unit import Chunk, draw_true_unit, simulate
 from imudrv.units import ARCSEC, DEG, DEG_PER_H, DEG_PER_SQRT_H, PPM, UG, URAD
+from imudrv.wire.layout import Layout
 
 Make = Callable[..., Scenario]
 
@@ -62,6 +63,11 @@ FINE = {
 def run(scenario: Scenario, interval_ns: int = MS, chunk: int = 65_536) -> Chunk:
     chunks = list(simulate(scenario, replace(LAYOUT, interval=Fraction(interval_ns)), chunk))
     return Chunk(np.concatenate([c.pulses for c in chunks]), np.concatenate([c.truth for c in chunks]))
+
+
+def run_as(layout: Layout, scenario: Scenario) -> Chunk:
+    (chunk,) = simulate(scenario, layout)
+    return chunk
 
 
 def size_effect(unit: Coefficients, got: Chunk) -> np.ndarray:
@@ -327,3 +333,28 @@ def test_an_invalid_interval_or_chunk_is_refused(
 ) -> None:
     with pytest.raises(InputError, match=message):
         next(simulate(scenario(REST), replace(LAYOUT, interval=Fraction(interval_ns)), chunk))
+
+
+@pytest.mark.parametrize(("profile", "step"), [("ilabs-ga-200", 10), ("kvh1775", 1), ("hg4930", None)])
+def test_counter_and_status_are_those_of_the_profile(scenario: Make, profile: str, step: int | None) -> None:
+    layout = profiles.load(profile).layout()
+    got = run_as(layout, scenario(REST, start={"counter": 1000}, unit={"warm_up_s": 0.25}))
+    first = 0 if step is None else 1000  # samples without a number are counted from 0
+    np.testing.assert_array_equal(
+        got.pulses["counter"], first + (step or 1) * np.arange(len(got.pulses)), strict=False
+    )
+    # Bits that mean good are set, and no bit of a unit that has none for the warm-up changes.
+    assert set(got.pulses["status"].tolist()) == {layout.status.inverted}
+
+
+def test_an_axis_saturates_at_the_width_of_its_own_field(scenario: Make) -> None:
+    layout = profiles.load("tamagawa-serial").layout()  # rates of 16 bits of 200 / 2^15 deg/s
+    x, y, z = layout.gyro.axes
+    assert x is not None
+    narrow = layout.gyro._replace(axes=(x._replace(bits=15), y, z))
+    layout = replace(layout, gyro=narrow)
+    # The peak of minimum jerk is 1.875 times the mean: 675 deg/s.
+    spin = {"rotate": {"angle_deg": 720.0, "duration_s": 2.0, "axis_n": [0.0, 0.0, 1.0]}}
+    for pose, axis, limit in (("x_up", 0, 100.0), ("z_up", 2, 200.0)):
+        rate = run_as(layout, scenario(spin, start={"pose": pose})).pulses["gyro"][:, axis]
+        assert rate.max() == pytest.approx(limit * DEG * 0.005, rel=1e-4)  # less a count
