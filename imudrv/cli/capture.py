@@ -57,6 +57,6 @@ def _unknown_gaps(count: int, layout: Layout) -> str:
     if layout.sequence.kind is SequenceKind.NONE:
         return f"{gaps}: the unit sends no counter, and the capture has no times of arrival"
     return (
-        f"{gaps}, counted with the smallest: or {float(layout.samples_a_round):g} samples more, any number of "
-        "times, for the capture has no times of arrival"
+        f"{gaps}, counted with the smallest: or {float(layout.samples_a_round):g} samples more, "
+        "any number of times, for the capture has no times of arrival"
     )
