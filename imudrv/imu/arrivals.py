@@ -60,7 +60,9 @@ def missing_periods(a: np.void, t_ns: int, elapsed_ns: int, period_ns: float, in
     for k in range(a["count"]):
         jitter = max(jitter, a["late_ns"][k])
     missing = 0
-    if late - jitter > period_ns / 2:
+    # Jitter near one sample interval looks like a missing sample: only what stays then counts.
+    is_clear = jitter < period_ns / 4 or period_ns > 2 * interval_ns
+    if is_clear and late - jitter > period_ns / 2:
         missing = max(1, int(np.rint((late - jitter / 2) / period_ns)))
         # No sample is early: one that is late by less than a period follows a pause.
         missing = min(missing, int((late + jitter + interval_ns) / period_ns))

@@ -7,6 +7,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
+from imudrv.imu.arrivals import KEPT
 from imudrv.imu.sequence import SampleCounts, SequenceTracker
 from imudrv.profiles import load
 from imudrv.records import FRAME, Flag, Records
@@ -201,8 +202,21 @@ def test_without_a_number_a_gap_is_found_from_host_time(timing: Timing) -> None:
         numbers = with_silence(silence)
         samples, counts = tracked(unit, frames(numbers, timing(numbers, unit.interval_ns), unit))
         assert (silence, counts.missing, counts.good) == (silence, silence, 600)
-        assert flagged(samples, Flag.GAP_BY_HOST_TIME) == [150]
-        assert flagged(samples, Flag.MISSING_BEFORE) == [150]
+        (place,) = flagged(samples, Flag.GAP_BY_HOST_TIME)
+        assert flagged(samples, Flag.MISSING_BEFORE) == [place]
+        # Jitter above a quarter of an interval hides the place; the least late of KEPT arrivals shows the gap.
+        assert place == 150 if timing is one_a_read else 150 <= place < 150 + 2 * KEPT
+
+
+@pytest.mark.parametrize("jitter_s", [3e-4, 1e-3])
+def test_jitter_of_an_interval_and_more_makes_no_gap_and_hides_none(jitter_s: float) -> None:
+    unit = layout(SequenceKind.NONE, rate=1000)
+    for lost in (0, 1, 5):
+        numbers = np.delete(np.arange(5000), slice(2500, 2500 + lost))
+        late = np.random.default_rng(lost).exponential(jitter_s * 1e9, len(numbers))
+        times = np.maximum.accumulate(one_a_read(numbers, unit.interval_ns) + late.astype(np.int64))
+        _, counts = tracked(unit, frames(numbers, times, unit))
+        assert (lost, counts.missing, counts.good) == (lost, lost, len(numbers))
 
 
 @pytest.mark.parametrize("rate", [Fraction(4096, 5), Fraction(300), Fraction(600), Fraction(1000, 3)])
