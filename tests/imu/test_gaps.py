@@ -204,7 +204,7 @@ def test_without_a_number_a_gap_is_found_from_host_time(timing: Timing) -> None:
         assert (silence, counts.missing, counts.good) == (silence, silence, 600)
         (place,) = flagged(samples, Flag.GAP_BY_HOST_TIME)
         assert flagged(samples, Flag.MISSING_BEFORE) == [place]
-        # Jitter above a quarter of an interval hides the place; the least late of KEPT arrivals shows the gap.
+        # Jitter above a quarter of an interval hides the place; the least late arrival shows the gap then.
         assert place == 150 if timing is one_a_read else 150 <= place < 150 + 2 * KEPT
 
 
