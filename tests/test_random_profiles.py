@@ -1,6 +1,7 @@
 """Any valid profile: what a unit sends is decoded again, and no input is lost without a reason."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from imudrv.imu.sequence import SequenceTracker
 from imudrv.profiles.schema import Profile
 from imudrv.records import FRAME, MESSAGE, REJECT, Flag, Records
 from imudrv.wire.can import CanAssembler
+from imudrv.wire.decoder import FrameDecoder
 from imudrv.wire.encode import CanEncoder, StreamEncoder
 from imudrv.wire.layout import Layout, SequenceKind, Values
 from imudrv.wire.stream import StreamDecoder
@@ -54,6 +56,32 @@ def decoded(layout: Layout, wire: np.ndarray, cuts: Sequence[int]) -> tuple[Reco
     assert decoder.pending == 0
     assert len(wire) == size * sum(map(len, frames)) + sum(int(r["length"].sum()) for r in rejects) + others
     return np.concatenate(frames), np.concatenate(rejects)
+
+
+@ANY_PROFILE
+@given(profiles(), SEEDS, st.lists(st.integers(0, 1000), max_size=40), st.integers(0, 40))
+def test_reads_at_once_give_the_bits_of_read_by_read(
+    document: dict[str, Any], seed: int, cuts: list[int], first: int
+) -> None:
+    layout, rng = layout_of(document), np.random.default_rng(seed)
+    wire = on_the_wire(layout, samples(rng, layout, 20, first=seed % 70_000)).copy()
+    if not layout.can:
+        at = rng.integers(0, len(wire), 2)
+        wire[at] = rng.integers(0, 256, 2)
+    ends = np.array([*sorted(min(cut, len(wire)) for cut in cuts), len(wire)])
+    times = np.cumsum(rng.integers(1, 10**7, len(ends)))
+    singly, at_once = FrameDecoder(layout), FrameDecoder(layout)
+    data = [wire[a:b] if layout.can else wire[a:b].tobytes() for a, b in pairwise([0, *ends.tolist()])]
+    one = np.concatenate([singly.feed(read, int(t_ns)) for read, t_ns in zip(data, times, strict=True)])
+    first = min(first, len(ends))
+    cut = int(ends[first - 1]) if first else 0
+    other = [
+        at_once.feed_reads(wire[:cut], ends[:first], times[:first]),
+        at_once.feed_reads(wire[cut:], ends[first:] - cut, times[first:]),
+    ]
+    assert same(np.concatenate(other), one)
+    assert at_once.rejected == singly.rejected
+    assert same(at_once.close(), singly.close())
 
 
 def same(one: Records, other: Records) -> bool:

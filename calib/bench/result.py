@@ -4,8 +4,7 @@ Both are computed from the wire bytes of the recordings, cut to the samples on w
 attempt.
 """
 
-from collections.abc import Iterator, Sequence
-from itertools import islice
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -39,10 +38,6 @@ from imudrv.wire.layout import Layout
 
 _PUBLISHED_PERIOD: Final = 1 << 32
 """Period of the counter of published increments."""
-
-
-_READS_PER_PIECE: Final = 1000
-"""Reads of the port that are decoded together; a live read brings one sample."""
 
 
 class Result(NamedTuple):
@@ -238,7 +233,9 @@ def _decode(attempt: Attempt) -> DecodedRecording:
     recording = Recording(attempt.recording)
     layout = recording.profile.layout()
     decoder, tracker = FrameDecoder(layout), SequenceTracker(layout)
-    pulses = [tracker.feed(decoder.feed(data)) for data in _wire(recording)]
+    pulses = [
+        tracker.feed(decoder.feed_reads(reads.data, reads.ends, reads.times)) for reads in recording.reads()
+    ]
     pulses.append(tracker.feed(decoder.close()))
     samples = np.concatenate(pulses)
     counter = samples["counter"]
@@ -281,10 +278,3 @@ def _missing(attempt: Attempt, decoded: DecodedRecording) -> str:
     if is_whole:
         return ""
     return f"its recording does not cover counters {edges[longest] + 1}..{edges[longest + 1] - 1}"
-
-
-def _wire(recording: Recording) -> Iterator[bytes | Records]:
-    """Yield the wire data of a recording in pieces of many reads."""
-    arrivals = (arrival.data for arrival in recording.arrivals())
-    while pieces := list(islice(arrivals, _READS_PER_PIECE)):
-        yield np.concatenate(pieces) if isinstance(pieces[0], np.ndarray) else b"".join(pieces)  # type: ignore[arg-type]
