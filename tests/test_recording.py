@@ -264,10 +264,11 @@ def test_reads_before_a_damaged_one_come_before_the_error(tmp_path: Path) -> Non
         next(arrivals)
 
 
-def test_a_time_that_no_clock_has_is_reported(recorded: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("damage", [0x00, 0x80])
+def test_a_time_that_no_clock_has_is_reported(recorded: Path, tmp_path: Path, damage: int) -> None:
     content = bytearray(recorded.read_bytes())
     at = places_of(content, 5)[3]
-    content[at + 22] = 0xFF  # the upper byte of its time
+    content[at + 31 - 9] = 0x40 + damage  # the upper byte of its time
     path = tmp_path / "bad.mcap"
     path.write_bytes(content)
     with pytest.raises(InputError, match=rf"at byte {at}: expected a time up to"):

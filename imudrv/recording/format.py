@@ -43,6 +43,9 @@ CALIBRATION: Final = "calibration.yaml"
 ORIGIN: Final = "imu50"
 """Name of the metadata record."""
 
+MAX_TIME_NS: Final = 2**62
+"""Largest time, and largest offset of a timebase: 146 years."""
+
 _HEAD: Final = 14  # bytes of a packed CAN message before its data
 _LONGEST: Final = 64
 

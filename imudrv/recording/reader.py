@@ -27,6 +27,7 @@ from imudrv.recording.format import (
     CLOCK,
     EVENTS,
     INCREMENTS,
+    MAX_TIME_NS,
     ORIGIN,
     PROFILE,
     STATUS,
@@ -39,8 +40,6 @@ from imudrv.wire.datagram import DatagramDecoder
 
 MAX_RECORD_BYTES: Final = 64 << 20
 """Largest record, and largest unpacked chunk, bytes."""
-MAX_TIME_NS: Final = 2**62
-"""Largest time, and largest offset, of a timebase: 146 years."""
 
 _RECORD: Final = struct.Struct("<BQ")
 _MESSAGE: Final = struct.Struct("<HIQQ")
@@ -207,7 +206,7 @@ class Recording:
         """Return the read of one message."""
         if message.log_time > MAX_TIME_NS:
             raise self._corrupt(offset, f"expected a time up to {MAX_TIME_NS} ns, got {message.log_time}")
-        data = np.frombuffer(message.data, np.uint8)
+        data = np.frombuffer(message.data, np.uint8).copy()  # the kernels are compiled for such arrays
         return Recorded(
             encoding, data, np.array([data.size]), np.array([message.log_time]), np.zeros(1, np.int64)
         )

@@ -12,7 +12,7 @@ from mcap.records import Channel
 from numpy.typing import NDArray
 
 from imudrv.kernels import kernel
-from imudrv.recording.format import CLOCK, WIRE
+from imudrv.recording.format import CLOCK, MAX_TIME_NS, WIRE
 from imudrv.records import Timebase
 from imudrv.wire.fields import Bytes, word
 
@@ -125,7 +125,7 @@ def _gather(
             break
         if what == _TAKE:
             t_ns = word(data, p + 15, 8, False)
-            if t_ns < 0:
+            if t_ns < 0 or t_ns > MAX_TIME_NS:
                 break
             for at in range(p + _LEAST, stop):
                 out[filled] = data[at]
