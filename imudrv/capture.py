@@ -2,8 +2,6 @@
 
 import os
 from collections.abc import Callable, Iterator
-from itertools import groupby, islice
-from operator import attrgetter
 from pathlib import Path
 from typing import TypeAlias
 
@@ -26,8 +24,6 @@ from imudrv.wire.decoder import CaptureDecoder, FrameDecoder, RejectedRuns
 
 MANY_ERROR_FRAMES = 0.01
 """Ratio of error frames to messages above which a bus is faulty."""
-READS_AT_ONCE = 1000
-"""Reads of a recording that are decoded at once."""
 
 Advance: TypeAlias = Callable[[int], object]
 """Called with the number of bytes read after each piece, to show progress."""
@@ -221,13 +217,11 @@ class Capture:
                 yield frames
                 advance(piece.bytes_read)
         else:
-            self._decoder = reads = FrameDecoder(self.layout)
-            for timebase, arrivals in groupby(self.recording.arrivals(), attrgetter("timebase")):
-                self._clock.follow(timebase)
-                while some := list(islice(arrivals, READS_AT_ONCE)):
-                    # Each read has its own time; the later stages cost by the call.
-                    yield np.concatenate([reads.feed(arrival.data, arrival.t_ns) for arrival in some])
-                    advance(sum(len(arrival.data) for arrival in some))
+            self._decoder = frame_decoder = FrameDecoder(self.layout)
+            for reads in self.recording.reads():
+                self._clock.follow(reads.timebase)
+                yield frame_decoder.feed_reads(reads.data, reads.ends, reads.times)
+                advance(reads.data.nbytes)
         frames = self._decoder.close()
         self._check_channel()
         yield frames

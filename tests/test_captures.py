@@ -197,7 +197,7 @@ def two_channels(logs: Path, path: Path) -> tuple[Path, tuple[str, str]]:
             "base.raw",
             ["--profile", "imu50-can"],
             2,
-            "got none in 35200 bytes of binary data; its beginning has",
+            "its beginning has frames of imu50-rs422: try --profile imu50-rs422",
         ),
         ("README.md", [], 2, "got text of no known form, which none of them fits; choose the unit's with"),
     ],

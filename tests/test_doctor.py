@@ -485,7 +485,7 @@ def test_limits_that_are_too_low_are_reported_with_their_fix(monkeypatch: pytest
 
 
 def test_a_wrong_url_or_profile_is_refused() -> None:
-    with pytest.raises(InputError, match=r"expected one of .*imu50-can"):
+    with pytest.raises(InputError, match=r"expected imu50-rs422, .*imu50-can"):
         list(examine("/dev/ttyUSB0", "imu51", 0.1))
     with pytest.raises(InputError):
         list(examine("nonsense", None, 0.1))

@@ -89,9 +89,9 @@ FAULTS: list[tuple[dict[str, Any], str, object, str]] = [
         2,
         "messages[0].fields[0].colour: unknown key; known are axis, bits, byte_order, ",
     ),
-    (SERIAL, "gyro.unit", "deg/sec", "got text 'deg/sec'; did you mean deg/s?"),
+    (SERIAL, "gyro.unit", "deg/sec", "got text 'deg/sec'; write deg/s"),
     (SERIAL, "gyro.unit", "furlong", "got text 'furlong'"),
-    (SERIAL, f"{FIELD}.type", "int16", "got text 'int16'; did you mean i16?"),
+    (SERIAL, f"{FIELD}.type", "int16", "got text 'int16'; write i16"),
     (SERIAL, f"{CHECK}.kind", "fletcher16", "got text 'fletcher16'; did you mean fletcher?"),
     (SERIAL, f"{FIELD}.name", "gyros", "got text 'gyros'; did you mean gyro?"),
     (
@@ -276,7 +276,7 @@ FAULTS: list[tuple[dict[str, Any], str, object, str]] = [
         changed(TIMED, "sample_rate_hz", 819.2),
         f"{COUNTER}.unit",
         "ms",
-        "time: expected a unit of which a sample takes 2 or more (or 1), got 1.2207 ms",
+        "time.unit: expected a unit of which a sample takes 2 or more (or 1), got 1.2207 ms",
     ),
     # status, temperatures, rate
     (

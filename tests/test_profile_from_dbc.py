@@ -164,7 +164,7 @@ def test_the_command_lists_prints_and_makes_profiles(
         (["from-dbc"], "from-dbc FILE.dbc"),
         (["kvh1775", "x.dbc"], "a profile's name alone"),
         (["from-dbc", "absent.dbc"], "absent.dbc"),
-        (["nix"], "kvh1775"),
+        (["nix"], "another one that `imudrv profiles` lists"),
     ):
         assert main(["profiles", *mistake]) == 2
         assert said in capsys.readouterr().err

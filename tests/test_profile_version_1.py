@@ -214,7 +214,7 @@ def test_the_file_of_version_1_gives_the_layout_of_the_shipped_one(name: str) ->
 @pytest.mark.parametrize(
     ("here", "instead", "said"),
     [
-        ("counts: increment", "counts: increments", "got text 'increments'; did you mean increment?"),
+        ("counts: increment", "counts: increments", "got text 'increments'; write increment"),
         (
             "width: 16",
             "width: sixteen",

@@ -1,5 +1,6 @@
 """Any valid profile: what a unit sends is decoded again, and no input is lost without a reason."""
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ from hypothesis import strategies as st
 from profile_strategy import profiles
 
 from imudrv.imu.sequence import SequenceTracker
-from imudrv.records import Flag
+from imudrv.records import Flag, Records
 from imudrv.wire.decoder import FrameDecoder
 from imudrv.wire.layout import SequenceKind, Values
 from tools.fuzz.any_profile import check_any_profile, layout_of, on_the_wire
@@ -80,3 +81,35 @@ def test_any_bytes_are_accounted_for_with_any_profile(
 ) -> None:
     size = len(data) // 80 * 80 if document["transport"] == "can" else len(data)
     check_any_profile(document, data[:size], cuts)
+
+
+@ANY_PROFILE
+@given(profiles(), SEEDS, st.lists(st.integers(0, 1000), max_size=40), st.integers(0, 40))
+def test_reads_at_once_give_the_bits_of_read_by_read(
+    document: dict[str, Any], seed: int, cuts: list[int], first: int
+) -> None:
+    layout, rng = layout_of(document), np.random.default_rng(seed)
+    wire = on_the_wire(layout, samples(rng, layout, 20, first=seed % 70_000)).copy()
+    if not layout.can:
+        at = rng.integers(0, len(wire), 2)
+        wire[at] = rng.integers(0, 256, 2)
+    ends = np.array([*sorted(min(cut, len(wire)) for cut in cuts), len(wire)])
+    times = np.cumsum(rng.integers(1, 10**7, len(ends)))
+    singly, at_once = FrameDecoder(layout), FrameDecoder(layout)
+    data = [wire[a:b] if layout.can else wire[a:b].tobytes() for a, b in pairwise([0, *ends.tolist()])]
+    one = np.concatenate([singly.feed(read, int(t_ns)) for read, t_ns in zip(data, times, strict=True)])
+    first = min(first, len(ends))
+    cut = int(ends[first - 1]) if first else 0
+    other = [
+        at_once.feed_reads(wire[:cut], ends[:first], times[:first]),
+        at_once.feed_reads(wire[cut:], ends[first:] - cut, times[first:]),
+    ]
+    assert same(np.concatenate(other), one)
+    assert at_once.rejected == singly.rejected
+    assert same(at_once.close(), singly.close())
+
+
+def same(one: Records, other: Records) -> bool:
+    """Whether records have the same bits in every column."""
+    assert one.dtype.names is not None
+    return len(one) == len(other) and all(one[n].tobytes() == other[n].tobytes() for n in one.dtype.names)

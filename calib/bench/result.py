@@ -4,8 +4,7 @@ Both are computed from the wire bytes of the recordings, cut to the samples on w
 attempt.
 """
 
-from collections.abc import Iterator, Sequence
-from itertools import islice
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -36,14 +35,12 @@ from imudrv.recording.reader import Recording
 from imudrv.records import Records
 from imudrv.site import Site
 from imudrv.wire.decoder import FrameDecoder
-from imudrv.wire.layout import NARROW_BITS, Layout, SequenceKind
+from imudrv.wire.layout import Layout, SequenceKind
 
 _PUBLISHED_PERIOD: Final = 1 << 32
 """Period of the counter of published increments."""
 
 
-_READS_PER_PIECE: Final = 1000
-"""Reads of the port that are decoded together; a live read brings one sample."""
 _LATER: Final = 1000
 """Samples by which the first one of a recording that can be decoded may follow the first one published."""
 _ROUNDING: Final = 1e-5
@@ -243,7 +240,9 @@ def _decode(attempt: Attempt) -> DecodedRecording:
     recording = Recording(attempt.recording)
     layout = recording.profile.layout()
     decoder, tracker = FrameDecoder(layout), SequenceTracker(layout)
-    pulses = [tracker.feed(decoder.feed(data, t_ns)) for data, t_ns in _wire(recording, layout)]
+    pulses = [
+        tracker.feed(decoder.feed_reads(reads.data, reads.ends, reads.times)) for reads in recording.reads()
+    ]
     pulses.append(tracker.feed(decoder.close()))
     samples = np.concatenate(pulses)
     if layout.sequence.kind is SequenceKind.COUNTER:
@@ -311,15 +310,3 @@ def _missing(attempt: Attempt, decoded: DecodedRecording) -> str:
     if is_whole:
         return ""
     return f"its recording does not cover counters {edges[longest] + 1}..{edges[longest + 1] - 1}"
-
-
-def _wire(recording: Recording, layout: Layout) -> Iterator[tuple[bytes | Records, int]]:
-    """Yield the wire data of a recording and their time of arrival; in large pieces where it is not used."""
-    sequence = layout.sequence
-    is_narrow = sequence.kind is SequenceKind.COUNTER and sequence.bits < NARROW_BITS
-    if is_narrow or sequence.kind is SequenceKind.NONE:
-        yield from ((arrival.data, arrival.t_ns) for arrival in recording.arrivals())
-        return
-    arrivals = (arrival.data for arrival in recording.arrivals())
-    while pieces := list(islice(arrivals, _READS_PER_PIECE)):
-        yield (np.concatenate(pieces) if isinstance(pieces[0], np.ndarray) else b"".join(pieces)), 0  # type: ignore[arg-type]

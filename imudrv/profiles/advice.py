@@ -63,6 +63,7 @@ _VALUES: Final = (
     (r"fields\.name", r"crc.*|check.*|sum", "write it in 'checks'"),
     (r"fields\.name", r"temp|t_?imu", "did you mean temperature?"),
     (r"fields\.name", r"flags?|error.*|bit|health|valid.*", "did you mean status?"),
+    (r"fields\.name", r"gyr\w*|rate|rotation|omega", "did you mean gyro?"),
     (r"fields\.name", r".*", _NOT_USED),
     (r"axis", r"[XYZ]", "in lower case"),
     (r"axis", r".*", "only the three axes x, y, z are used; leave other numbers out"),

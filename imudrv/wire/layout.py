@@ -170,10 +170,10 @@ class Check(NamedTuple):
     @property
     def is_plain(self) -> bool:
         """Whether it is the usual one: a CRC or a sum of bytes, of one range that is all on the wire."""
-        is_sum = self.kind is CheckKind.SUM and self.word == 1 and not (self.modulo or self.negated)
+        is_sum = self.kind is CheckKind.SUM and self.word == 1 and not self.modulo
         return (
             len(self.ranges) == 1
-            and not self.suffix
+            and not (self.suffix or self.negated)
             and self.width % 8 == 0
             and (is_sum or self.kind >= CheckKind.CRC)
         )

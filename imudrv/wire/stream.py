@@ -85,6 +85,8 @@ class StreamDecoder:
         self._state["latest"]["status"] = layout.status.inverted
         self._state["latest"]["temperature"] = np.nan
         self._rejects = np.zeros(_REJECTS_AT_ONCE, REJECT)
+        self._end: NDArray[np.int64] = np.zeros(1, np.int64)  # of the one read of `feed`
+        self._time: NDArray[np.int64] = np.zeros(1, np.int64)
 
     @property
     def pending(self) -> int:
@@ -118,6 +120,36 @@ class StreamDecoder:
             Frames and rejects that they complete.
         """
         piece = np.frombuffer(data, np.uint8)
+        self._end[0], self._time[0] = piece.size, t_ns
+        return self._feed(piece, self._end, self._time)
+
+    def feed_reads(
+        self,
+        data: NDArray[np.uint8],
+        ends: NDArray[np.int64],
+        times: NDArray[np.int64],
+    ) -> Decoded:
+        """Decode the bytes of several reads; the result is that of feeding one read after the other.
+
+        Parameters
+        ----------
+        data : ndarray of uint8
+            All bytes.
+        ends : ndarray of int64, shape (n,)
+            Where each read ends in them; the last one at their end.
+        times : ndarray of int64, shape (n,)
+            Time of arrival of each read, host clock, ns.
+
+        Returns
+        -------
+        Decoded
+            Frames and rejects that they complete.
+        """
+        if len(ends) != len(times) or (ends[-1] if len(ends) else 0) != data.size:
+            raise ValueError(f"expected an end and a time a read, the last end {data.size}")
+        return self._feed(data, ends, times)
+
+    def _feed(self, piece: NDArray[np.uint8], ends: NDArray[np.int64], times: NDArray[np.int64]) -> Decoded:
         stop = self._pending + piece.size
         if stop + SLACK > self._buffer.size:
             grown = np.zeros(stop + SLACK, np.uint8)
@@ -126,14 +158,23 @@ class StreamDecoder:
         self._buffer[self._pending : stop] = piece
         frames = room = np.zeros(stop // self._length + 1, FRAME)
         rejects: list[Records] = []
-        position = 0
+        position = read = 0
         while True:
-            position, found, rejected, is_done = self._walk(
-                self._buffer, position, stop, t_ns, self._tables, self._state, room, self._rejects
+            position, read, found, rejected = self._walk(
+                self._buffer,
+                position,
+                self._pending,
+                ends,
+                times,
+                read,
+                self._tables,
+                self._state,
+                room,
+                self._rejects,
             )
             if rejected:
                 rejects.append(self._rejects[:rejected].copy())
-            if is_done:
+            if read == len(ends):
                 break
             room = room[found:]
         self._pending = stop - position
@@ -176,35 +217,42 @@ _DIFFERS, _MATCHES, _IS_CUT = range(3)
 def _scan(
     data: NDArray[np.uint8],
     p: int,
-    stop: int,
-    t_ns: int,
+    begin: int,
+    ends: NDArray[np.int64],
+    times: NDArray[np.int64],
+    read: int,
     tables: Tables,
     state: Records,
     frames: Records,
     rejects: Records,
-) -> tuple[int, int, int, bool]:
-    """Walk from `p` until the data or the room for rejects ends.
+) -> tuple[int, int, int, int]:
+    """Walk from `p`, read by read, until the reads or the room for rejects end.
+
+    Read k ends at `begin + ends[k]`; `read` is the first one that is not walked to its end. A message may
+    have to wait for bytes behind it that show what is before it, so a later read may complete it.
 
     Returns
     -------
     tuple
-        Position of the first byte that is neither in a frame nor rejected; number of frames and of rejects;
-        whether the data have ended. Bytes before that position then leave the buffer.
+        Position of the first byte that is neither in a frame nor rejected; first read that is not walked to
+        its end; number of frames and of rejects. After all reads, bytes before that position leave the
+        buffer.
     """
     # Out of the tuple once: each access inside the loop would count references.
     kinds, fields, multiplexed, constants, _ = tables
     kind, s = kinds[0], state[0]
     length, offset = kind["length"], s["offset"]
     found = rejected = 0
-    while rejected < rejects.shape[0]:
+    while read < ends.shape[0] and rejected < rejects.shape[0]:
+        stop = begin + ends[read]
         header = _compare(data, p, stop, constants)
         if header == _DIFFERS:
             _skip(s, offset + p, _NO_SYNC)
             p += 1
             continue
         if header == _IS_CUT or p + length > stop:
-            s["offset"] += p
-            return p, found, rejected, True
+            read += 1
+            continue
         is_good = plain_check_holds(data, p, kind)
         if s["reject_offset"] >= 0:
             _close_reject(rejects[rejected], s, offset + p)
@@ -215,40 +263,45 @@ def _scan(
             continue
         frame = frames[found]
         fill(data, p, kind, fields, multiplexed, frame)
-        frame["offset"], frame["t_ns"] = offset + p, t_ns
+        frame["offset"], frame["t_ns"] = offset + p, times[read]
         frame["damaged"] = (s["skipped"] + length - 1) // length
         s["skipped"] = 0
         found += 1
         p += length
-    return p, found, rejected, False
+    if read == ends.shape[0]:
+        s["offset"] += p
+    return p, read, found, rejected
 
 
 @kernel
 def _scan_kinds(
     data: NDArray[np.uint8],
     p: int,
-    stop: int,
-    t_ns: int,
+    begin: int,
+    ends: NDArray[np.int64],
+    times: NDArray[np.int64],
+    read: int,
     tables: Tables,
     state: Records,
     frames: Records,
     rejects: Records,
-) -> tuple[int, int, int, bool]:
+) -> tuple[int, int, int, int]:
     """Do what `_scan` does, for several kinds of message, multiplexed numbers or any checks; slower."""
     kinds, fields, multiplexed, constants, checks = tables
     s = state[0]
     offset = s["offset"]
     parts, length = _parts_of(kinds)
     found = rejected = 0
-    while rejected + MAX_MESSAGES < rejects.shape[0]:
+    while read < ends.shape[0] and rejected + MAX_MESSAGES < rejects.shape[0]:
+        stop = begin + ends[read]
         k = _kind_at(data, p, stop, kinds, constants)
         if k == _NO_KIND:
             _skip(s, offset + p, _NO_SYNC)
             p += 1
             continue
         if k == _CUT_KIND:
-            s["offset"] += p
-            return p, found, rejected, True
+            read += 1
+            continue
         kind = kinds[k]
         is_good = checks_hold(data, p, kind, checks)
         if s["reject_offset"] >= 0:
@@ -281,12 +334,14 @@ def _scan_kinds(
         if s["parts"] == parts:
             frames[found] = s["sample"]
             frame = frames[found]
-            frame["offset"], frame["t_ns"] = s["part_offset"][0], t_ns
+            frame["offset"], frame["t_ns"] = s["part_offset"][0], times[read]
             frame["damaged"], frame["torn"] = (s["skipped"] + length - 1) // length, s["torn"]
             hold(frame, s["latest"])
             s["parts"] = s["skipped"] = s["torn"] = 0
             found += 1
-    return p, found, rejected, False
+    if read == ends.shape[0]:
+        s["offset"] += p
+    return p, read, found, rejected
 
 
 @kernel

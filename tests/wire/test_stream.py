@@ -103,6 +103,28 @@ def test_a_frame_carries_the_time_of_the_bytes_that_completed_it():
     assert decoder.feed(WORKED[1:], 3).frames["t_ns"].tolist() == [3]
 
 
+def test_reads_at_once_have_the_time_of_the_read_that_completed_each_frame():
+    decoder = StreamDecoder(RS422)
+    data = np.frombuffer(b"\x00" + WORKED * 3 + WORKED[:10], np.uint8)
+    ends, times = np.array([20, 44, 44, 45, 133, 143]), np.array([1, 2, 3, 4, 5, 6])
+    assert decoder.feed_reads(data, ends, times).frames["t_ns"].tolist() == [4, 5, 5]
+    more = np.frombuffer(WORKED[10:], np.uint8)
+    assert decoder.feed_reads(more, np.array([34]), np.array([7])).frames["t_ns"].tolist() == [7]
+
+
+def test_reads_whose_ends_are_not_those_of_the_data_are_refused():
+    with pytest.raises(ValueError, match="the last end 44"):
+        StreamDecoder(RS422).feed_reads(np.frombuffer(WORKED, np.uint8), np.array([43]), np.array([1]))
+
+
+def test_more_rejects_than_fit_in_one_scan_end_a_read_at_its_end_too():
+    data = np.frombuffer(DAMAGED * 3000 + WORKED, np.uint8)
+    ends = np.arange(1, 3002) * LENGTH
+    found = StreamDecoder(RS422).feed_reads(data, ends, ends)
+    assert found.rejects["offset"].tolist() == list(range(0, 3000 * LENGTH, LENGTH))
+    assert found.frames["t_ns"].tolist() == [3001 * LENGTH]
+
+
 def test_a_frame_has_the_number_of_frame_lengths_rejected_before_it():
     data = WORKED + DAMAGED + DAMAGED[:30] + WORKED + WORKED + b"\x00" + WORKED
     assert decode(data).frames["damaged"].tolist() == [0, 2, 0, 1]
