@@ -2,7 +2,7 @@
 
 import weakref
 from tempfile import SpooledTemporaryFile, gettempdir
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -201,6 +201,11 @@ class BlockStore:
 
     def __len__(self) -> int:
         return self._count
+
+    def __deepcopy__(self, _: dict[int, object]) -> Self:
+        copy = type(self)()  # with a file of its own
+        copy.append(self.rows(0, len(self)))
+        return copy
 
     def append(self, blocks: Records) -> None:
         """Append blocks.
