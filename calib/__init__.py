@@ -25,33 +25,27 @@ Data flow; every module can be read alone::
     validation      navigation with and without compensation, on recordings and simulated units
     dither          effect of gyro dither on the size effect
     reports         reports as text, for a terminal and as HTML
+    messages        texts for the operator, by key
     api             functions for a notebook      cli  the command `calib`
 
 Increments are compensated for everything except the size effect. The conventions are those of `imudrv`.
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from calib.api import load_procedure, predict, validate
-    from calib.bench.session import Session
-    from calib.estimation.predict import PlannedRotation
-    from calib.identification import EstimationOptions, identify
-    from calib.lever_arms.gauge import LeverArms
+    from calib.api import load_procedure as load_procedure
+    from calib.api import predict as predict
+    from calib.api import validate as validate
+    from calib.bench.session import Session as Session
+    from calib.estimation.predict import PlannedRotation as PlannedRotation
+    from calib.identification import EstimationOptions as EstimationOptions
+    from calib.identification import identify as identify
+    from calib.lever_arms.gauge import LeverArms as LeverArms
 
-__all__ = [
-    "EstimationOptions",
-    "LeverArms",
-    "PlannedRotation",
-    "Session",
-    "identify",
-    "load_procedure",
-    "predict",
-    "validate",
-]
-
-_MODULES: Final = {
+# Imported at first use, so that a program pays only for what it needs.
+_MODULES = {
     "EstimationOptions": "calib.identification",
     "LeverArms": "calib.lever_arms.gauge",
     "PlannedRotation": "calib.estimation.predict",
@@ -61,12 +55,13 @@ _MODULES: Final = {
     "predict": "calib.api",
     "validate": "calib.api",
 }
+__all__ = sorted(_MODULES)
 
 
-def __getattr__(name: str) -> Any:
-    if name in _MODULES:
-        return getattr(import_module(_MODULES[name]), name)
-    raise AttributeError(f"module 'calib' has no attribute {name!r}")
+def __getattr__(name: str) -> object:
+    if name not in _MODULES:
+        raise AttributeError(f"module 'calib' has no attribute {name!r}")
+    return getattr(import_module(_MODULES[name]), name)
 
 
 def __dir__() -> list[str]:

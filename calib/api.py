@@ -2,63 +2,23 @@
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from calib.certificate import lever_arms_of
-from calib.detection.noise import Noise
 from calib.estimation.predict import PlannedRotation, Prediction
 from calib.estimation.predict import predict as predict_plan
-from calib.estimation.runs import Priors
-from calib.html_table import html_table
-from calib.inputs import StrPath, profile_of, site_of
+from calib.inputs import StrPath, profile_of, require_six_axes, site_of
 from calib.procedure import plan
 from calib.procedure.schema import Procedure
 from calib.validation.navigate import navigate
-from calib.validation.trial import RATE_FILTER, Trial, TrialSettings
-from calib.validation.verdict import TrialMetrics, evaluate
+from calib.validation.trial import RATE_FILTER, TrialSettings
+from calib.validation.verdict import Validation, evaluate
 from imudrv.calibration import Calibration, read_calibration
 from imudrv.capture import Capture
 from imudrv.imu.rate_filter import RateFilterName
 from imudrv.nav.alignment import ALIGNMENT_S
 from imudrv.profiles.schema import Profile
 from imudrv.site import Site
-from imudrv.units import MM
-
-
-@dataclass(frozen=True, repr=False)
-class Validation:
-    """A capture navigated with and without size-effect compensation.
-
-    Attributes
-    ----------
-    trial : Trial
-        Both velocities.
-    metrics : TrialMetrics
-        Their comparison; `metrics.good` is the verdict.
-    """
-
-    trial: Trial
-    metrics: TrialMetrics
-
-    def __repr__(self) -> str:
-        return f"<Validation: {self._summary}>"
-
-    def _repr_html_(self) -> str:
-        metrics = self.metrics
-        head = ("horizontal velocity, mm/s", "not compensated", "compensated")
-        rows = [("first second after the motion", metrics.first), ("whole rest, rms", metrics.whole)]
-        return html_table(
-            self._summary, head, [(name, *(f"{v / MM:.2f}" for v in pair[:2])) for name, pair in rows]
-        )
-
-    @property
-    def _summary(self) -> str:
-        without, compensated = (v / MM for v in self.metrics.first[:2])
-        return (
-            f"{self.trial.name}: {'good' if self.metrics.good else 'bad'}; velocity after the motion "
-            f"{without:.2f} mm/s, compensated {compensated:.2f} mm/s"
-        )
 
 
 def validate(
@@ -110,19 +70,15 @@ def validate(
         lever_arms_of(calibration, name)
     path = Path(capture)
     opened = Capture(path, profile_of(profile), channel)
-    settings = TrialSettings(opened.layout, calibration, site_of(site), align_s, rate_filter, skew_s)
-    trial = navigate(path.name, opened.pulses(advance), settings)
-    return Validation(trial, evaluate(trial))
+    layout = require_six_axes(opened.layout)
+    settings = TrialSettings(layout, calibration, site_of(site), align_s, rate_filter, skew_s)
+    return evaluate(navigate(path.name, opened.pulses(advance), settings))
 
 
 def predict(
-    procedure: StrPath | Procedure | Sequence[PlannedRotation],
-    *,
-    site: StrPath | Site,
-    noise: Noise | None = None,
-    priors: Priors | None = None,
+    procedure: StrPath | Procedure | Sequence[PlannedRotation], *, site: StrPath | Site
 ) -> Prediction:
-    """Predict the accuracy of the lever arms from a procedure.
+    """Predict the accuracy of the lever arms from a procedure, for a unit of typical noise.
 
     Parameters
     ----------
@@ -130,10 +86,6 @@ def predict(
         A shipped procedure's name, a procedure file, a procedure, or its rotations.
     site : path-like or Site
         Place of the unit.
-    noise : Noise, optional
-        Noise of the sensors; default: `calib.procedure.plan.TYPICAL_NOISE`.
-    priors : Priors, optional
-        Uncertainty of the static calibration.
 
     Returns
     -------
@@ -147,8 +99,8 @@ def predict(
     if isinstance(procedure, str | os.PathLike):
         procedure = load_procedure(procedure)
     if isinstance(procedure, Procedure):
-        return plan.predicted(procedure, site_of(site), noise, priors)
-    return predict_plan(procedure, site_of(site).latitude_rad, noise or plan.TYPICAL_NOISE, priors)
+        return plan.predicted(procedure, site_of(site))
+    return predict_plan(procedure, site_of(site).latitude_rad, plan.TYPICAL_NOISE)
 
 
 def load_procedure(name_or_path: StrPath) -> Procedure:

@@ -1,4 +1,12 @@
-"""Signed body axes, '+X' to '-Z'."""
+"""Signed body axes, '+X' to '-Z'.
+
+>>> print(vector("-Y"))
+[ 0. -1.  0.]
+>>> opposite("-Y")
+'+Y'
+>>> axis_name(np.array([0.1, -0.9, 0.3]))
+'-Y'
+"""
 
 from typing import Literal
 

@@ -30,12 +30,12 @@ _COVARIANCE_DECIMALS: Final = 9
 """Decimals of their covariance, mm^2."""
 
 
-def certificate(findings: IdentificationResult, arms: LeverArms) -> Calibration:
+def certificate(identification: IdentificationResult, arms: LeverArms) -> Calibration:
     """Return the new certificate of the unit: its calibration with the lever arms and their provenance.
 
     Parameters
     ----------
-    findings : IdentificationResult
+    identification : IdentificationResult
         The result.
     arms : LeverArms
         The lever arms in the desired gauge.
@@ -50,11 +50,17 @@ def certificate(findings: IdentificationResult, arms: LeverArms) -> Calibration:
     InputError
         The result does not allow a certificate, see `LeverArmEstimate.refusals`.
     """
-    result = findings.result
+    result = identification.result
     if result.refusals:
         raise InputError(f"no certificate: {'; '.join(result.refusals)}")
-    found = {"method": result.method, **inputs_document(findings), **outcome_document(result)}
-    return with_lever_arms(findings.basis.calibration, arms, PROVENANCE_IDENTIFIED, found, findings.created)
+    found = {"method": result.method, **inputs_document(identification), **outcome_document(result)}
+    return with_lever_arms(
+        identification.prior_calibration.calibration,
+        arms,
+        PROVENANCE_IDENTIFIED,
+        found,
+        identification.created,
+    )
 
 
 def with_lever_arms(
@@ -83,15 +89,12 @@ def with_lever_arms(
     if key == PROVENANCE_IDENTIFIED:
         provenance.pop(PROVENANCE_CONVERTED, None)
     provenance[key] = {"software": software(), **how}
-    covariance = None if arms.covariance is None else arms.covariance / MM**2
-    rows = np.round(arms.r_b / MM, _R_DECIMALS) + 0.0  # no -0
-    size_effect = SizeEffect(
-        r_mm=SensingPoints(**{axis: _row(r) for axis, r in zip("xyz", rows, strict=True)}),
-        gauge=arms.gauge,
-        covariance_mm2=None
-        if covariance is None
-        else tuple(_row(r) for r in np.round(covariance, _COVARIANCE_DECIMALS) + 0.0),
-    )
+    covariance: Any = None
+    if arms.covariance is not None:
+        rounded = np.round(arms.covariance / MM**2, _COVARIANCE_DECIMALS) + 0.0  # no -0
+        covariance = tuple(map(tuple, rounded.tolist()))
+    r_mm = np.round(arms.r_b / MM, _R_DECIMALS) + 0.0
+    size_effect = SizeEffect(r_mm=sensing_points(r_mm), gauge=arms.gauge, covariance_mm2=covariance)
     return calibration.model_copy(
         update={
             "created": when or datetime.now(UTC).replace(microsecond=0),
@@ -173,6 +176,7 @@ def write(path: Path, calibration: Calibration) -> None:
     write_calibration(path, calibration)
 
 
-def _row(values: Array) -> Any:
-    """Return a row as the file models take it."""
-    return tuple(values.tolist())
+def sensing_points(r_mm: Array) -> SensingPoints:
+    """Return sensing points, rows of a matrix in mm, as the calibration file has them."""
+    x, y, z = map(tuple, r_mm.tolist())
+    return SensingPoints(x=x, y=y, z=z)

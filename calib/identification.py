@@ -6,7 +6,7 @@ Certificate and report are functions of `IdentificationResult` and compute nothi
 import hashlib
 import os
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from html import escape
 from importlib.metadata import version
@@ -19,22 +19,26 @@ from calib.detection.acceptance import RotationLimits
 from calib.estimation.joint import estimate_joint
 from calib.estimation.plain import estimate_plain
 from calib.estimation.result import TO_DIFFERENCES, Extra, LeverArmEstimate, RunResult
-from calib.estimation.runs import CaptureRuns, NavigationOptions, Priors, Run, navigate_rotations
-from calib.inputs import StrPath, profile_of, site_of
+from calib.estimation.runs import CaptureRuns, Priors, Run, navigate_capture
+from calib.inputs import StrPath, profile_of, require_six_axes, site_of
 from calib.lever_arms.gauge import LeverArms
+from calib.messages import english
 from imudrv.arrays import Array
-from imudrv.calibration import Calibration, coefficients, read_calibration_file
+from imudrv.calibration import Calibration, read_calibration_file
 from imudrv.capture import Capture
 from imudrv.errors import InputError
 from imudrv.files import settings_file
 from imudrv.files.atomic import sha256, unchanged
-from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import rate_filter
 from imudrv.profiles.schema import Profile
 from imudrv.recording.reader import Recording
 from imudrv.records import Records
 from imudrv.site import Site
 from imudrv.units import MM
+
+
+def software() -> str:
+    """Return name and version of the software."""
+    return f"imu50 {version('imu50')}"
 
 
 @dataclass(frozen=True)
@@ -97,6 +101,12 @@ class Temperature(NamedTuple):
     most_degc: float
 
 
+def temperature_ranges(channels: Sequence[str], least: Array, most: Array) -> tuple[Temperature, ...]:
+    """Return the temperature range of each channel that the unit reported: those that are not NaN."""
+    ranges = zip(channels, least.tolist(), most.tolist(), strict=False)
+    return tuple(Temperature(channel, low, high) for channel, low, high in ranges if low <= high)
+
+
 @dataclass(frozen=True)
 class CaptureSummary:
     """A capture and its rotations.
@@ -115,7 +125,7 @@ class CaptureSummary:
         Sample counts and losses, in one line.
     temperatures : tuple of Temperature
         Range of each channel that the unit reported.
-    evidence : CaptureRuns
+    rotations : CaptureRuns
         Rests, rotations, runs.
     channel : str or None
         CAN channel that was read from a candump log.
@@ -127,7 +137,7 @@ class CaptureSummary:
     profile: str
     counts: str
     temperatures: tuple[Temperature, ...]
-    evidence: CaptureRuns
+    rotations: CaptureRuns
     channel: str | None = None
 
 
@@ -139,7 +149,7 @@ class IdentificationResult:
     ----------
     result : LeverArmEstimate
         The estimate.
-    basis : PriorCalibration
+    prior_calibration : PriorCalibration
         The calibration that it extends.
     site : Site
         Place of the unit.
@@ -156,13 +166,13 @@ class IdentificationResult:
     """
 
     result: LeverArmEstimate
-    basis: PriorCalibration
+    prior_calibration: PriorCalibration
     site: Site
     limits: RotationLimits
     priors: Priors
     sources: tuple[CaptureSummary, ...]
-    created: datetime
-    software: str
+    created: datetime = field(default_factory=lambda: datetime.now(UTC).replace(microsecond=0))
+    software: str = field(default_factory=software)
 
     def __repr__(self) -> str:
         return f"<IdentificationResult: {self._summary}>"
@@ -175,7 +185,7 @@ class IdentificationResult:
         result, n = self.result, len(self.result.runs)
         verdict = "; ".join(result.refusals) or "usable for a certificate"
         return (
-            f"unit {self.basis.calibration.serial_number}, method {result.method}, "
+            f"unit {self.prior_calibration.calibration.serial_number}, method {result.method}, "
             f"{n} rotation{'s' if n > 1 else ''}, rank {result.rank}, sigma of the differences up to "
             f"{result.differences_sigma.max() / MM:.3f} mm: {verdict}"
         )
@@ -183,7 +193,7 @@ class IdentificationResult:
     @property
     def arms(self) -> LeverArms:
         """The lever arms in the gauge of the estimate."""
-        return LeverArms(self.result.R_b, self.result.covariance, self.result.gauge)
+        return self.result.arms
 
     @property
     def differences_correlation(self) -> Array:
@@ -196,7 +206,7 @@ class IdentificationResult:
     @property
     def runs(self) -> tuple[Run, ...]:
         """The runs, in the order of `result.runs`."""
-        return tuple(run for source in self.sources for run in source.evidence.runs)
+        return tuple(run for source in self.sources for run in source.rotations.runs)
 
 
 def scatter(run: RunResult) -> float:
@@ -251,41 +261,32 @@ def identify(
     paths = _paths(captures)
     if not isinstance(calibration, PriorCalibration):
         calibration = prior_calibration(paths, calibration)
-    shared = _Shared(
-        calibration.calibration.without_size_effect(),
-        site_of(site),
-        profile_of(profile),
-        channel,
-        NavigationOptions(),
-        advance,
-    )
+    site, priors, limits = site_of(site), Priors(), RotationLimits()
     sources: list[CaptureSummary] = []
     for path in paths:
-        source = _read(path, _label(path, [source.label for source in sources]), shared)
+        source = _read(
+            path,
+            _label(path, [source.label for source in sources]),
+            calibration=calibration.calibration.without_size_effect(),
+            site=site,
+            profile=profile_of(profile),
+            channel=channel,
+            advance=advance,
+        )
         for other in sources:
             if other.sha256 == source.sha256:
                 raise InputError(f"{path}: expected another capture, got that of {other.name} once more")
         sources.append(source)
-    runs = [run for source in sources for run in source.evidence.runs]
+    runs = [run for source in sources for run in source.rotations.runs]
     if not runs:
         raise InputError(
             "\n  ".join(["expected at least one usable rotation, got none:", *_rejections(sources)])
         )
-    priors = shared.options.priors
     try:
         result = _estimate(runs, priors, options)
     except InputError as error:
         raise InputError("\n  ".join([str(error), *_rejections(sources)])) from None
-    return IdentificationResult(
-        result,
-        calibration,
-        shared.site,
-        shared.options.limits,
-        priors,
-        tuple(sources),
-        datetime.now(UTC).replace(microsecond=0),
-        software(),
-    )
+    return IdentificationResult(result, calibration, site, limits, priors, tuple(sources))
 
 
 def prior_calibration(
@@ -323,37 +324,18 @@ def prior_calibration(
                 f"{path}: expected a calibration, got a capture without one; give its file (--calibration)"
             )
         texts.setdefault(text, path)
+    if not texts:
+        raise InputError("captures: expected one file at least, got none")
     if len(texts) > 1:
         raise InputError(
             "expected recordings made with one calibration, got different ones in "
             f"{' and '.join(map(str, texts.values()))}; give the right one (--calibration)"
         )
-    for text, path in texts.items():
-        model = settings_file.parse_text(text.encode(), Calibration, f"{path}: calibration")
-        if unit not in (None, model.serial_number):
-            raise InputError(
-                f"{path}: expected a recording of unit {unit!r}, got one of {model.serial_number!r}"
-            )
-        return PriorCalibration(
-            model, f"calibration in {path.name}", hashlib.sha256(text.encode()).hexdigest()
-        )
-    raise InputError("captures: expected one file at least, got none")
-
-
-def software() -> str:
-    """Return name and version of the software."""
-    return f"imu50 {version('imu50')}"
-
-
-class _Shared(NamedTuple):
-    """What all captures have in common."""
-
-    calibration: Calibration
-    site: Site
-    profile: Profile | None
-    channel: str | None
-    options: NavigationOptions
-    advance: Callable[[int], None]
+    ((text, path),) = texts.items()
+    model = settings_file.parse_text(text.encode(), Calibration, f"{path}: calibration")
+    if unit not in (None, model.serial_number):
+        raise InputError(f"{path}: expected a recording of unit {unit!r}, got one of {model.serial_number!r}")
+    return PriorCalibration(model, f"calibration in {path.name}", hashlib.sha256(text.encode()).hexdigest())
 
 
 def _paths(captures: StrPath | Sequence[StrPath]) -> list[Path]:
@@ -375,56 +357,49 @@ def _label(path: Path, taken: Sequence[str]) -> str:
     return label
 
 
-def _read(path: Path, label: str, shared: _Shared) -> CaptureSummary:
+def _read(
+    path: Path,
+    label: str,
+    *,
+    calibration: Calibration,
+    site: Site,
+    profile: Profile | None,
+    channel: str | None,
+    advance: Callable[[int], None],
+) -> CaptureSummary:
     """Find and navigate the rotations of a capture, with its sample counts and temperatures."""
-    known = coefficients(shared.calibration)
-    capture = Capture(path, shared.profile, shared.channel)
     low, high = np.full(6, np.inf), np.full(6, -np.inf)
 
-    def increments() -> Iterator[Records]:
-        nonlocal capture
-        capture = Capture(path, shared.profile, shared.channel)
-        layout = capture.layout
-        compensator = Compensator(known, layout, rate_filter("causal", layout.interval_ns))
-        for pulses in capture.pulses(shared.advance):
-            if len(pulses):
-                np.fmin(low, np.fmin.reduce(pulses["temperature_degc"], axis=0), out=low)
-                np.fmax(high, np.fmax.reduce(pulses["temperature_degc"], axis=0), out=high)
-            yield compensator.feed(pulses)
-        yield compensator.close()
+    def pulses() -> Iterator[Records]:
+        for piece in capture.pulses(advance):
+            if len(piece):
+                np.fmin(low, np.fmin.reduce(piece["temperature_degc"], axis=0), out=low)
+                np.fmax(high, np.fmax.reduce(piece["temperature_degc"], axis=0), out=high)
+            yield piece
 
     try:
         with unchanged(path):  # two passes, and one for the hash
-            evidence = navigate_rotations(increments, known.C_ba, shared.site, label, shared.options)
+            capture = Capture(path, profile, channel)
+            layout = require_six_axes(capture.layout)
+            rotations = navigate_capture(pulses, layout, calibration, site, label)
             digest = sha256(path)
     except InputError as error:
         raise error if str(path) in str(error) else InputError(f"{path}: {error}") from None
-    names = capture.layout.temperature_names
-    return CaptureSummary(
-        label,
-        path.name,
-        digest,
-        capture.layout.name,
-        str(capture.tracker.counts),
-        tuple(
-            Temperature(name, float(least), float(most))
-            for name, least, most in zip(names, low, high, strict=False)
-            if least <= most
-        ),
-        evidence,
-        shared.channel,
-    )
+    temperatures = temperature_ranges(layout.temperature_names, low, high)
+    counts = str(capture.tracker.counts)
+    return CaptureSummary(label, path.name, digest, layout.name, counts, temperatures, rotations, channel)
 
 
 def _rejections(sources: Sequence[CaptureSummary]) -> list[str]:
     """Return why each motion was rejected, one line each; one line for a capture without motion."""
     lines = []
     for source in sources:
-        if not source.evidence.segments.rotations:
-            seconds = source.evidence.segments.duration_s
+        if not source.rotations.segments.rotations:
+            seconds = source.rotations.segments.duration_s
             lines.append(f"{source.name}: {seconds:.1f} s at rest, no motion at all")
         lines += [
-            f"{source.name}: motion at {rotation.start_s:.1f}..{rotation.stop_s:.1f} s: {'; '.join(reasons)}"
-            for rotation, reasons in source.evidence.rejected
+            f"{source.name}: motion at {rotation.start_s:.1f}..{rotation.stop_s:.1f} s: "
+            + "; ".join(map(english, reasons))
+            for rotation, reasons in source.rotations.rejected
         ]
     return lines

@@ -10,6 +10,7 @@ from calib.estimation.result import LeverArmEstimate
 from calib.estimation.runs import Priors, Run
 from calib.identification import CaptureSummary, IdentificationResult, scatter
 from calib.lever_arms.gauge import LeverArms
+from calib.messages import english
 from imudrv.arrays import Array
 from imudrv.files.atomic import atomic_write
 from imudrv.units import ARCSEC, DEG, DEG_PER_H, MM, PPM, STANDARD_GRAVITY, UG, URAD
@@ -20,12 +21,12 @@ FORMAT: Final = "imu50-identification"
 VERSION: Final = 1
 
 
-def result_document(findings: IdentificationResult, arms: LeverArms) -> dict[str, Any]:
+def result_document(identification: IdentificationResult, arms: LeverArms) -> dict[str, Any]:
     """Return the whole result as plain data, with units in the names.
 
     Parameters
     ----------
-    findings : IdentificationResult
+    identification : IdentificationResult
         The result.
     arms : LeverArms
         The lever arms in the desired gauge.
@@ -35,15 +36,15 @@ def result_document(findings: IdentificationResult, arms: LeverArms) -> dict[str
     dict
         For JSON.
     """
-    result = findings.result
+    result = identification.result
     return {
         "format": FORMAT,
         "version": VERSION,
-        "created": _time(findings.created),
-        "software": findings.software,
-        "serial_number": findings.basis.calibration.serial_number,
+        "created": _time(identification.created),
+        "software": identification.software,
+        "serial_number": identification.prior_calibration.calibration.serial_number,
         "method": result.method,
-        **inputs_document(findings),
+        **inputs_document(identification),
         "gauge": arms.gauge,
         "r_mm": _by_axis(arms.r_b / MM),
         "covariance_mm2": None if arms.covariance is None else (arms.covariance / MM**2).tolist(),
@@ -57,7 +58,7 @@ def result_document(findings: IdentificationResult, arms: LeverArms) -> dict[str
             "velocity_white_m_s": result.noise.velocity_white,
             "velocity_pulse_m_s": result.noise.velocity_pulse,
         },
-        "nuisances_si": [
+        "parameters_si": [
             {
                 "name": n.name,
                 "value": n.value,
@@ -67,9 +68,9 @@ def result_document(findings: IdentificationResult, arms: LeverArms) -> dict[str
             }
             for n in result.parameters
         ],
-        "correlation_of_r_with_nuisances": result.correlation.tolist(),
-        "correlation_of_differences_with_nuisances": findings.differences_correlation.tolist(),
-        "left_out": [
+        "correlation_of_r_with_parameters": result.correlation.tolist(),
+        "correlation_of_differences_with_parameters": identification.differences_correlation.tolist(),
+        "leave_one_out": [
             {
                 "run": one.label,
                 "rank": one.rank,
@@ -88,7 +89,7 @@ def result_document(findings: IdentificationResult, arms: LeverArms) -> dict[str
                 "v_n_m_s": outcome.v_n.tolist(),
                 "fitted_n_m_s": outcome.fitted_n.tolist(),
             }
-            for run, outcome in zip(findings.runs, result.runs, strict=True)
+            for run, outcome in zip(identification.runs, result.runs, strict=True)
         ],
     }
 
@@ -112,32 +113,32 @@ def write_json(path: Path, document: dict[str, Any]) -> None:
         file.write(json.dumps(document, indent=1, allow_nan=False).encode() + b"\n")
 
 
-def inputs_document(findings: IdentificationResult) -> dict[str, Any]:
+def inputs_document(identification: IdentificationResult) -> dict[str, Any]:
     """Return the inputs of an identification."""
-    basis = findings.basis
+    calibration = identification.prior_calibration
     return {
-        "calibration": {"name": basis.name, "sha256": basis.sha256},
-        "site": findings.site.model_dump(exclude={"format", "version"}, exclude_none=True),
-        "captures": [_capture(source) for source in findings.sources],
-        "limits": asdict(findings.limits),
-        "priors": _priors(findings.priors),
+        "calibration": {"name": calibration.name, "sha256": calibration.sha256},
+        "site": identification.site.model_dump(exclude={"format", "version"}, exclude_none=True),
+        "captures": [_capture(source) for source in identification.sources],
+        "limits": asdict(identification.limits),
+        "priors": _priors(identification.priors),
     }
 
 
 def _capture(source: CaptureSummary) -> dict[str, Any]:
-    evidence = source.evidence
+    rotations = source.rotations
     return {
         "name": source.name,
         "sha256": source.sha256,
         "profile": source.profile,
         **({} if source.channel is None else {"channel": source.channel}),
-        "duration_s": evidence.segments.duration_s,
+        "duration_s": rotations.segments.duration_s,
         "samples": source.counts,
         "temperature_degc": {t.channel: [t.least_degc, t.most_degc] for t in source.temperatures},
-        "runs": [run.label for run in evidence.runs],
+        "runs": [run.label for run in rotations.runs],
         "rejected": [
-            {"start_s": rotation.start_s, "stop_s": rotation.stop_s, "reasons": list(reasons)}
-            for rotation, reasons in evidence.rejected
+            {"start_s": rotation.start_s, "stop_s": rotation.stop_s, "reasons": [*map(english, reasons)]}
+            for rotation, reasons in rotations.rejected
         ],
     }
 

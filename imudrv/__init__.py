@@ -21,7 +21,7 @@ The flow is one way; each stage is a package or module that can be read alone::
            compensates it (`Compensator`)
     sinks  destinations of increments, by URL, and the recorder
     pipeline, service   the stages in a row, and the one thread that runs them live
-    capture, recording  the same from files
+    capture, recording  the same from files; capture_files reads these in all their forms
     nav    strapdown mathematics      sim    simulated unit
 
 Data are numpy record arrays (`imudrv.records`), time along the first axis: one row live, millions offline.

@@ -21,7 +21,7 @@ from imudrv.units import ARCSEC, DEG_PER_H, MM, PPM, UG
 NORM_TOLERANCE: Final = 0.1
 """Largest deviation from 1 of the length of a row or column of an axes matrix."""
 MIN_DETERMINANT: Final = 0.5
-"""Smallest magnitude of an axes matrix's determinant: axes may be exchanged or reversed, but not parallel."""
+"""Smallest determinant of an axes matrix: axes may be turned, but neither mirrored nor parallel."""
 GAUGE_TOLERANCE_MM: Final = 1e-5
 """Largest deviation from the stated gauge: ten times the rounding to six decimals."""
 COVARIANCE_TOLERANCE_MM2: Final = 5e-6
@@ -46,7 +46,12 @@ def _axes(matrix: Matrix3) -> Matrix3:
     determinant = np.linalg.det(C)
     if abs(determinant) < MIN_DETERMINANT:
         raise ValueError(
-            f"expected three independent axes, |determinant| >= {MIN_DETERMINANT:g}, got {determinant:.3g}"
+            f"expected three independent axes, determinant >= {MIN_DETERMINANT:g}, got {determinant:.3g}"
+        )
+    if determinant < 0.0:
+        raise ValueError(
+            f"expected right-handed axes, determinant > 0, got {determinant:.3g}: a mirror image; for a "
+            "reversed sensor set sign: -1 in the profile, for two exchanged ones exchange their axis there"
         )
     return matrix
 
@@ -92,6 +97,7 @@ def _range(limits: tuple[float, float]) -> tuple[float, float]:
 # Wide enough for any unit of the kind, narrow enough to catch another unit of measure.
 GyroScale = Annotated[float, Key(gt=1e-9, le=1e4)]
 AccelerometerScale = Annotated[float, Key(gt=1e-9, le=1e9)]
+Scale = Annotated[float, Key(ge=0.5, le=2.0)]
 GyroBias = Annotated[float, Key(ge=-3600, le=3600)]
 AccelerometerBias = Annotated[float, Key(ge=-1e5, le=1e5)]
 GyroBiasSlope = Annotated[float, Key(ge=-100, le=100)]
@@ -110,49 +116,46 @@ def _array(values: object, unit: float = 1.0) -> Array:
 
 
 class Gyro(Model):
-    """The gyros: ``dtheta_b = C_bg @ (scale * N) - bias * tau``."""
+    """The gyros: ``dtheta_b = C_bg @ (scale * N) - bias * tau``.
 
-    scale_arcsec_per_pulse: tuple[GyroScale, GyroScale, GyroScale]
+    N are pulses, or angles of a unit that sends them in angular units; then the scale is about 1.
+    """
+
+    scale_arcsec_per_pulse: tuple[GyroScale, GyroScale, GyroScale] | None = None
+    scale: tuple[Scale, Scale, Scale] | None = None
     bias_deg_per_h: tuple[GyroBias, GyroBias, GyroBias]
     C_bg: Axes
 
-    @property
-    def scale_rad_per_pulse(self) -> Array:
-        """Scale factors, rad per pulse, shape (3,), gyro axes."""
-        return _array(self.scale_arcsec_per_pulse, ARCSEC)
-
-    @property
-    def bias_rad_per_s(self) -> Array:
-        """Biases, rad/s, shape (3,), body axes."""
-        return _array(self.bias_deg_per_h, DEG_PER_H)
-
-    @property
-    def C_bg_array(self) -> Array:
-        """Gyro axes to body, shape (3, 3)."""
-        return _array(self.C_bg)
+    @model_validator(mode="after")
+    def _has_one_scale(self) -> Self:
+        _require_one(self.scale_arcsec_per_pulse, "scale_arcsec_per_pulse", self.scale)
+        return self
 
 
 class Accelerometer(Model):
-    """The accelerometers: ``dv_b = C_ba @ (N / scale - bias * tau)``."""
+    """The accelerometers: ``dv_b = C_ba @ (N / scale - bias * tau)``.
 
-    scale_pulse_per_m_s: tuple[AccelerometerScale, AccelerometerScale, AccelerometerScale]
+    N are pulses, or velocities of a unit that sends them in units of velocity; then the scale is about 1.
+    """
+
+    scale_pulse_per_m_s: tuple[AccelerometerScale, AccelerometerScale, AccelerometerScale] | None = None
+    scale: tuple[Scale, Scale, Scale] | None = None
     bias_ug: tuple[AccelerometerBias, AccelerometerBias, AccelerometerBias]
     C_ba: Axes
 
-    @property
-    def scale_pulse_per_m_s_array(self) -> Array:
-        """Scale factors, pulses per m/s, shape (3,), accelerometer axes."""
-        return _array(self.scale_pulse_per_m_s)
+    @model_validator(mode="after")
+    def _has_one_scale(self) -> Self:
+        _require_one(self.scale_pulse_per_m_s, "scale_pulse_per_m_s", self.scale)
+        return self
 
-    @property
-    def bias_m_s2(self) -> Array:
-        """Biases, m/s^2, shape (3,), accelerometer axes."""
-        return _array(self.bias_ug, UG)
 
-    @property
-    def C_ba_array(self) -> Array:
-        """Accelerometer axes to body, shape (3, 3)."""
-        return _array(self.C_ba)
+def _require_one(of_pulses: object, name: str, scale: object) -> None:
+    if (of_pulses is None) == (scale is None):
+        came = "neither" if scale is None else "both"
+        raise ValueError(
+            f"expected {name} for a unit that sends pulses, or scale (three numbers about 1) for one that "
+            f"sends other units, got {came}"
+        )
 
 
 class SensingPoints(Model):
@@ -207,26 +210,6 @@ class Temperature(Model):
     gyro_scale_ppm_per_k: tuple[ScaleSlope, ScaleSlope, ScaleSlope]
     accelerometer_bias_ug_per_k: tuple[AccelerometerBiasSlope, AccelerometerBiasSlope, AccelerometerBiasSlope]
     accelerometer_scale_ppm_per_k: tuple[ScaleSlope, ScaleSlope, ScaleSlope]
-
-    @property
-    def gyro_bias_rad_per_s_per_k(self) -> Array:
-        """Change of the gyro biases, rad/s per kelvin, shape (3,)."""
-        return _array(self.gyro_bias_deg_per_h_per_k, DEG_PER_H)
-
-    @property
-    def gyro_scale_per_k(self) -> Array:
-        """Relative change of the gyro scale factors per kelvin, shape (3,)."""
-        return _array(self.gyro_scale_ppm_per_k, PPM)
-
-    @property
-    def accelerometer_bias_m_s2_per_k(self) -> Array:
-        """Change of the accelerometer biases, m/s^2 per kelvin, shape (3,)."""
-        return _array(self.accelerometer_bias_ug_per_k, UG)
-
-    @property
-    def accelerometer_scale_per_k(self) -> Array:
-        """Relative change of the accelerometer scale factors per kelvin, shape (3,)."""
-        return _array(self.accelerometer_scale_ppm_per_k, PPM)
 
 
 class Calibration(Model):
@@ -349,21 +332,23 @@ def coefficients(calibration: Calibration) -> Coefficients:
     """
     gyro, accelerometer, terms = calibration.gyro, calibration.accelerometer, calibration.temperature
     return Coefficients(
-        gyro_scale=gyro.scale_rad_per_pulse,
-        gyro_bias=gyro.bias_rad_per_s,
-        C_bg=gyro.C_bg_array,
-        accelerometer_scale=accelerometer.scale_pulse_per_m_s_array,
-        accelerometer_bias=accelerometer.bias_m_s2,
-        C_ba=accelerometer.C_ba_array,
+        gyro_scale=_array(gyro.scale_arcsec_per_pulse or gyro.scale, ARCSEC if gyro.scale is None else 1.0),
+        gyro_bias=_array(gyro.bias_deg_per_h, DEG_PER_H),
+        C_bg=_array(gyro.C_bg),
+        accelerometer_scale=_array(accelerometer.scale_pulse_per_m_s or accelerometer.scale),
+        accelerometer_bias=_array(accelerometer.bias_ug, UG),
+        C_ba=_array(accelerometer.C_ba),
         r_b=calibration.size_effect.r_m if calibration.size_effect else None,
         temperature=TemperatureTerms(
             terms.reference_degc,
             *terms.range_degc,
-            gyro_bias=terms.gyro_bias_rad_per_s_per_k,
-            gyro_scale=terms.gyro_scale_per_k,
-            accelerometer_bias=terms.accelerometer_bias_m_s2_per_k,
-            accelerometer_scale=terms.accelerometer_scale_per_k,
+            gyro_bias=_array(terms.gyro_bias_deg_per_h_per_k, DEG_PER_H),
+            gyro_scale=_array(terms.gyro_scale_ppm_per_k, PPM),
+            accelerometer_bias=_array(terms.accelerometer_bias_ug_per_k, UG),
+            accelerometer_scale=_array(terms.accelerometer_scale_ppm_per_k, PPM),
         )
         if terms
         else None,
+        gyro_in_pulses=gyro.scale is None,
+        accelerometer_in_pulses=accelerometer.scale is None,
     )

@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Callable, Iterator
-from itertools import islice
 from pathlib import Path
 from typing import TypeAlias
 
@@ -10,11 +9,12 @@ import numpy as np
 
 from imudrv import profiles
 from imudrv.calibration import Calibration, coefficients, read_calibration
+from imudrv.capture_files import CaptureFile, DamageSigns
+from imudrv.diagnosis import find_mismatch, fitting_profiles, sequence_fault
 from imudrv.errors import InputError
 from imudrv.imu.clock import ClockModel
 from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import RateFilterName
-from imudrv.imu.rate_filter import rate_filter as make_filter
 from imudrv.imu.sequence import SequenceTracker
 from imudrv.profiles.schema import Profile
 from imudrv.recording.reader import Recording
@@ -22,10 +22,8 @@ from imudrv.records import Flag, Reason, Records
 from imudrv.wire.candump import CandumpDecoder
 from imudrv.wire.decoder import CaptureDecoder, FrameDecoder, RejectedRuns
 
-CHUNK_BYTES = 1 << 19
-"""Bytes read at once: few enough for the cache, many enough that Python's overhead does not matter."""
-READS_AT_ONCE = 1000
-"""Reads of a recording that are decoded at once."""
+MANY_ERROR_FRAMES = 0.01
+"""Ratio of error frames to messages above which a bus is faulty."""
 
 Advance: TypeAlias = Callable[[int], object]
 """Called with the number of bytes read after each piece, to show progress."""
@@ -41,18 +39,22 @@ class Capture:
     Parameters
     ----------
     path : path-like
-        Wire bytes; for a CAN profile a candump log; a name that ends in ``.mcap`` is a recording.
+        Wire bytes, a CAN log or a recording, in any of the forms of `imudrv.capture_files`.
     profile : Profile or path-like, optional
         Wire format of the unit: a profile, the name of a shipped one, or the path of its file. A recording
-        contains it.
+        contains it. If absent, that of the shipped ones which fits the beginning of the file.
     channel : str, optional
-        Channel of a candump log to read; needed if the log has several.
+        Channel of a CAN log to read; needed if the log has several.
 
     Attributes
     ----------
     path : Path
     size : int
-        Size of the file, bytes.
+        Size of the file as it is stored, bytes.
+    file : CaptureFile
+        What the file is.
+    is_profile_found : bool
+        Whether the profile was found among the shipped ones.
     recording : Recording or None
         The recording, if the file is one.
     profile : Profile
@@ -60,12 +62,14 @@ class Capture:
         Layout of the profile.
     tracker : SequenceTracker
         Its `counts` are those of the samples read so far; each reading of the file begins anew.
+    sequence_fault : str
+        Why most good frames read so far do not continue the counter; empty if they do.
 
     Raises
     ------
     InputError
-        There is no such file, it is empty, a profile is needed, or there is a channel and the file is no
-        candump log.
+        There is no such file, it is empty or is none of the known forms by its name or content, none or
+        several of the shipped profiles fit, or there is a channel and the file is no CAN log.
 
     Examples
     --------
@@ -80,32 +84,32 @@ class Capture:
         channel: str | None = None,
     ) -> None:
         self.path = path = Path(path)
-        try:
-            with path.open("rb") as file:
-                self._head = file.read(1 << 16)
-            self.size = path.stat().st_size
-        except OSError as error:
-            raise InputError(f"{path}: expected a capture file, cannot read it: {error.strerror}") from error
-        if not self._head:
-            raise InputError(f"{path}: expected a capture, got an empty file")
-        self.recording = Recording(path) if path.suffix == ".mcap" else None
+        self.file = CaptureFile(path)
+        self.size = self.file.size
+        self.recording = Recording(path) if self.file.is_recording else None
+        self._channel = channel
+        self.is_profile_found = profile is None and self.recording is None
         if profile is None:
-            if self.recording is None:
-                raise InputError(f"{path}: expected --profile; only a recording contains its profile")
-            profile = self.recording.profile
+            profile = self._found_profile() if self.recording is None else self.recording.profile
         self.profile = profile if isinstance(profile, Profile) else profiles.load(profile)
         self.layout = self.profile.layout()
-        if channel is not None and (self.recording is not None or not self.layout.can):
-            kind = "a recording" if self.recording is not None else f"a capture of {self.layout.name}"
-            raise InputError(
-                f"{path}: --channel {channel}: expected a candump log, got {kind}; leave --channel out"
-            )
-        self.tracker = SequenceTracker(self.layout)
-        self._channel = channel
+        self._check_transport()
+        self._begin()
         self._decoder: CaptureDecoder | FrameDecoder = FrameDecoder(self.layout)
+        self._signs = DamageSigns()
 
     def __repr__(self) -> str:
         return f"<Capture {self.path}, {self.profile.name}, {self.tracker.counts.frames} samples read>"
+
+    def _begin(self) -> None:
+        self.tracker = SequenceTracker(self.layout)
+        self._gaps = 0
+        self._counters = np.zeros(0, np.int64)
+
+    @property
+    def sequence_fault(self) -> str:
+        """See the class."""
+        return sequence_fault(self.tracker.counts, self._gaps, self._counters)
 
     @property
     def rejected(self) -> dict[Reason, RejectedRuns]:
@@ -114,8 +118,22 @@ class Capture:
 
     @property
     def channels(self) -> dict[str, int]:
-        """Number of messages of each channel of a candump log, first of the one that is read."""
+        """Number of messages of each channel of a CAN log, first of the one that is read."""
         return self._log.channels if self._log is not None else {}
+
+    @property
+    def hints(self) -> list[str]:
+        """What the losses look like and what to do, one sentence each; of what was read so far."""
+        counts, hints = self.tracker.counts, []
+        if counts.lost or not counts.frames:
+            hints += self._signs.hints
+        errors, messages = self.rejected.get(Reason.ERROR_FRAME), sum(self.channels.values())
+        if errors is not None and errors.runs > MANY_ERROR_FRAMES * messages:
+            hints.append(
+                f"{errors.runs} error frames beside {messages} messages: the bus is faulty; "
+                "check its wiring, termination and bit rate"
+            )
+        return hints
 
     @property
     def _log(self) -> CandumpDecoder | None:
@@ -140,13 +158,20 @@ class Capture:
             The whole file held no frame of the profile; the message names the shipped profile that fits, if
             one does. Or a log has several channels and none was chosen, or not the chosen one.
         """
-        self.tracker = SequenceTracker(self.layout)
+        self._begin()
+        self._clock = ClockModel(
+            self.layout.interval_ns, self.profile.transmission_ns, self.layout.counter_step
+        )
         for frames in self._frames(advance):
-            yield self.tracker.feed(frames)
+            if not len(self._counters):
+                self._counters = frames["counter"].copy()
+            pulses = self.tracker.feed(frames)
+            self._gaps += int(np.count_nonzero(pulses["flags"] & Flag.MISSING_BEFORE))
+            yield pulses
         if self.tracker.counts.frames == 0:
             raise InputError(
-                f"{self.path}: expected frames of {self.layout.name}, "
-                f"got none in {self.size} bytes{self._hint()}"
+                f"{self.path}: expected frames of {self.layout.name}, got none in {self.size} bytes of "
+                f"{self.file.description}: {'; '.join([*self.hints, self._mismatch()])}"
             )
 
     def increments(self, compensator: Compensator, advance: Advance = _no_progress) -> Iterator[Records]:
@@ -175,28 +200,28 @@ class Capture:
                 yield _unlocked(compensator.feed(pulses))
             yield _unlocked(compensator.close())
             return
-        clock = ClockModel(self.layout.interval_ns, self.profile.transmission_ns)
         for pulses in self.pulses(advance):
-            clock.feed(pulses)
-            yield clock.stamp(compensator.feed(pulses))
-        yield clock.stamp(compensator.close())
+            self._clock.feed(pulses)
+            yield self._clock.stamp(compensator.feed(pulses))
+        yield self._clock.stamp(compensator.close())
 
     def _frames(self, advance: Advance) -> Iterator[Records]:
         if self.recording is None:
             self._decoder = decoder = CaptureDecoder(self.layout, self._channel)
-            with self.path.open("rb") as file:
-                while data := file.read(CHUNK_BYTES):
-                    frames = decoder.feed(data)
-                    self._check_channel()
-                    yield frames
-                    advance(len(data))
+            self._signs = DamageSigns()
+            for piece in self.file.pieces():
+                if not self.layout.can:
+                    self._signs.feed(piece.data)
+                frames = decoder.feed(piece.data)
+                self._check_channel()
+                yield frames
+                advance(piece.bytes_read)
         else:
-            self._decoder = reads = FrameDecoder(self.layout)
-            arrivals = self.recording.arrivals()
-            while some := list(islice(arrivals, READS_AT_ONCE)):
-                # Each read has its own time; the later stages cost by the call.
-                yield np.concatenate([reads.feed(arrival.data, arrival.t_ns) for arrival in some])
-                advance(sum(len(arrival.data) for arrival in some))
+            self._decoder = frame_decoder = FrameDecoder(self.layout)
+            for reads in self.recording.reads():
+                self._clock.follow(reads.timebase)
+                yield frame_decoder.feed_reads(reads.data, reads.ends, reads.times)
+                advance(reads.data.nbytes)
         frames = self._decoder.close()
         self._check_channel()
         yield frames
@@ -205,14 +230,61 @@ class Capture:
         if self._log is not None:
             self._log.check_channel(str(self.path), "--channel ")
 
-    def _hint(self) -> str:
-        if self.recording is None:
-            for name in profiles.shipped():
-                layout = profiles.load(name).layout()
-                decoder = CaptureDecoder(layout, self._channel)
-                if layout.name != self.layout.name and len(decoder.feed(self._head)):
-                    return f"; its beginning has frames of {name}: try --profile {name}"
-        return "; is it the right file, and the right --profile?"
+    def _mismatch(self) -> str:
+        """Say what the beginning of the file holds instead of frames, and which shipped profile fits it."""
+        if self.recording is not None:
+            return "its profile is not that of the unit"
+        head = self.file.head()
+        data = CandumpDecoder(self._channel).feed(head)[0] if self.layout.can else head
+        return f"{find_mismatch(self.profile, data, ()).found}; {self._other_profile()}"
+
+    def _check_transport(self) -> None:
+        """Refuse a profile, or a channel, that does not fit what the file is."""
+        kind = self.file.kind
+        if self._channel is not None and (self.recording is not None or not self.layout.can):
+            came = "a recording" if self.recording is not None else f"a capture of {self.layout.name}"
+            raise InputError(
+                f"{self.path}: --channel {self._channel}: expected a CAN log, got {came}; leave --channel out"
+            )
+        if kind is not None and kind.transport and (kind.transport == "can") != self.layout.can:
+            expected = "a CAN log" if self.layout.can else "wire bytes"
+            raise InputError(
+                f"{self.path}: expected {expected} for {self.layout.name}, got {self.file.description}; "
+                f"{self._other_profile()}"
+            )
+
+    def _found_profile(self) -> Profile:
+        """Return the shipped profile that fits the beginning of the file."""
+        found = self._fitting_profiles()
+        if len(found) == 1:
+            return found[0]
+        if found:
+            names = " and ".join(profile.name for profile in found)
+            raise InputError(
+                f"{self.path}: its beginning fits {names} equally well; choose one with --profile"
+            )
+        raise InputError(
+            f"{self.path}: expected a capture of a shipped profile (list them with `imudrv profiles`), got "
+            f"{self.file.description}, which none of them fits; choose the unit's with --profile"
+        )
+
+    def _other_profile(self) -> str:
+        """Return which profile to try instead."""
+        found = [profile for profile in self._fitting_profiles() if profile.name != self.layout.name]
+        if not found:
+            return "no shipped profile fits its beginning; check the line settings, or write a profile"
+        return f"its beginning has frames of {found[0].name}: try --profile {found[0].name}"
+
+    def _fitting_profiles(self) -> list[Profile]:
+        head, kind = self.file.head(), self.file.kind
+        shipped = [profiles.load(name) for name in profiles.shipped()]
+        found = [] if kind is not None and kind.transport == "can" else fitting_profiles(shipped, head)
+        if not found:
+            log = CandumpDecoder(self._channel)
+            messages, _ = log.feed(head)
+            log.check_channel(str(self.path), "--channel ")
+            found = fitting_profiles(shipped, messages)
+        return found
 
 
 def compensate(
@@ -267,10 +339,7 @@ def compensate(
         raise InputError(f"{capture.path}: expected a calibration, for the file contains none; give one")
     if not isinstance(calibration, Calibration):
         calibration = read_calibration(calibration)
-    interval_ns = capture.layout.interval_ns
-    compensator = Compensator(
-        coefficients(calibration), capture.layout, make_filter(rate_filter, interval_ns)
-    )
+    compensator = Compensator(coefficients(calibration), capture.layout, rate_filter)
     return np.concatenate(list(capture.increments(compensator, advance)))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from imudrv.imu.clock import ClockModel
 from imudrv.imu.coefficients import Coefficients
 from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import RateFilter
+from imudrv.imu.rate_filter import RateFilterName
 from imudrv.imu.sequence import SequenceTracker
 from imudrv.profiles.schema import Profile
 from imudrv.records import INCREMENTS, PULSES, Flag, Records
@@ -41,16 +41,16 @@ class Pipeline:
         Profile of the unit.
     coefficients : Coefficients
         Calibration of the unit.
-    rate_filter : RateFilter
+    rate_filter : {'causal', 'centred', 'dither'}
         Rate filter of the size effect.
     """
 
-    def __init__(self, profile: Profile, coefficients: Coefficients, rate_filter: RateFilter) -> None:
+    def __init__(self, profile: Profile, coefficients: Coefficients, rate_filter: RateFilterName) -> None:
         self._layout = profile.layout()
         self._rate_filter = rate_filter
         self.decoder = FrameDecoder(self._layout)
         self.tracker = SequenceTracker(self._layout)
-        self.clock = ClockModel(self._layout.interval_ns, profile.transmission_ns)
+        self.clock = ClockModel(self._layout.interval_ns, profile.transmission_ns, self._layout.counter_step)
         self._compensator = Compensator(coefficients, self._layout, rate_filter)
         self._next: Compensator | None = None
         self._repeats = False
@@ -93,11 +93,6 @@ class Pipeline:
         """
         self._next = Compensator(coefficients, self._layout, self._rate_filter)
         self._repeats = True
-
-    @property
-    def replacing(self) -> bool:
-        """Whether a new calibration is not in use yet."""
-        return self._next is not None
 
     def _process(self, frames: Records) -> PipelineOutput:
         if not len(frames):

@@ -9,11 +9,10 @@ print(receiver.counts)
 import os
 import select
 import socket
-from collections.abc import Callable
-from functools import partial
+from contextlib import AbstractContextManager
+from fractions import Fraction
 from types import TracebackType
 from typing import Final, Self
-from urllib.parse import urlsplit
 
 import numpy as np
 import serial
@@ -22,14 +21,13 @@ from imudrv.errors import InputError
 from imudrv.imu.sequence import SampleCounts, SequenceTracker
 from imudrv.ports.base import PortLostError
 from imudrv.ports.serial import explain
-from imudrv.ports.url import Url, split
+from imudrv.profiles.schema import SerialLine
 from imudrv.records import FRAME, Records
 from imudrv.sinks.serial import BAUDRATE
+from imudrv.url import LOOPBACK, Url, device_path, host_and_port, serial_settings, split
 from imudrv.wire.datagram import DatagramDecoder
-from imudrv.wire.layout import Layout
+from imudrv.wire.layout import Layout, Sequence, SequenceKind
 
-_EXPECTED: Final = "udp://[HOST]:PORT, tcp://HOST:PORT or serial:///dev/ttyUSB0?baudrate=921600"
-_LOOPBACK: Final = "127.0.0.1"
 _AT_ONCE: Final = 1 << 16
 _QUEUE: Final = 1 << 22  # the system's default holds a quarter of a second of single samples
 _CONNECT_S: Final = 5.0
@@ -37,16 +35,13 @@ _COUNTED: Final = Layout(
     name="I50N",
     can=False,
     fd=False,
-    big_endian=False,
-    interval_ns=1,
-    totals=False,
-    counter_bits=32,
-    pulse_bits=32,
+    interval=Fraction(1),
+    sequence=Sequence(SequenceKind.COUNTER, 32),
     messages=(),
 )
 
 
-class Receiver:
+class Receiver(AbstractContextManager["Receiver"]):
     """Iterator over arrays of one or more samples as they arrive; made by `receive`.
 
     Each sample comes once and in the order of the counter: one that the network duplicates or delays is
@@ -72,26 +67,15 @@ class Receiver:
         self._decoder = DatagramDecoder()
         self._tracker = SequenceTracker(_COUNTED)
         self._ordered(b"")  # compiles the kernels before samples arrive
-        self._device = _open(split(url))
-        self._is_packets = isinstance(self._device, socket.socket) and (
-            self._device.type == socket.SOCK_DGRAM
-        )
-        self._read: Callable[[int], bytes] = (
-            self._device.recv
-            if isinstance(self._device, socket.socket)
-            else partial(os.read, self._device.fileno())
-        )
+        parts = split(url, ("udp", "tcp", "serial"))
+        self._is_packets = parts.scheme == "udp"
+        self._device = _open(parts)
         self._is_open = True
 
     @property
     def counts(self) -> SampleCounts:
         """Sample counts so far."""
         return self._tracker.counts
-
-    @property
-    def lost(self) -> int:
-        """Number of samples that were sent, by their counter, and not output."""
-        return self.counts.lost
 
     def __iter__(self) -> Self:
         return self
@@ -106,7 +90,7 @@ class Receiver:
         """
         while self._is_open and select.select([self._device.fileno()], (), (), self._timeout_s)[0]:
             try:
-                data = self._read(_AT_ONCE)
+                data = os.read(self._device.fileno(), _AT_ONCE)
             except OSError:
                 data = b""
                 self.close()
@@ -120,9 +104,6 @@ class Receiver:
         """Close the connection; the iteration ends."""
         self._is_open = False
         self._device.close()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -169,15 +150,7 @@ def receive(url: str, timeout_s: float | None = None) -> Receiver:
 def _open(url: Url) -> socket.socket | serial.Serial:
     if url.scheme == "serial":
         return _open_line(url)
-    if url.scheme not in ("udp", "tcp"):
-        raise InputError(f"{url.text}: expected {_EXPECTED}, got {url.scheme}://")
-    try:
-        parts = urlsplit(f"//{url.address}")
-        host, port = parts.hostname or _LOOPBACK, parts.port
-    except ValueError:
-        port = None
-    if port is None or parts.path or url.options:
-        raise InputError(f"{url.text}: expected {url.scheme}://HOST:PORT")
+    host, port = host_and_port(url, LOOPBACK)
     try:
         if url.scheme == "tcp":
             return socket.create_connection((host, port), _CONNECT_S)
@@ -200,12 +173,10 @@ def _listen(host: str, port: int) -> socket.socket:
 
 
 def _open_line(url: Url) -> serial.Serial:
-    baudrate = url.options.get("baudrate", str(BAUDRATE))
-    if not url.address or url.options.keys() - {"baudrate"} or not baudrate.isdecimal():
-        raise InputError(f"{url.text}: expected {_EXPECTED}")
+    path, settings = device_path(url), serial_settings(url, SerialLine(baudrate=BAUDRATE))
     try:
-        return serial.Serial(url.address, int(baudrate), timeout=0, exclusive=True)
+        return serial.Serial(path, **settings, timeout=0, exclusive=True)
     except ValueError as error:
         raise InputError(f"{url.text}: {error}") from error
     except serial.SerialException as error:
-        raise PortLostError(f"{url.text}: {explain(url.address, error)}") from error
+        raise PortLostError(f"{url.text}: {explain(path, error)}") from error

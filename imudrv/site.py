@@ -6,11 +6,18 @@ from pydantic import Field as Key
 
 from imudrv.files.model import Model
 from imudrv.nav.earth import normal_gravity
+from imudrv.nav.mechanisation import Place
 from imudrv.units import DEG
 
 
 class Site(Model):
-    """A location on the Earth; `gravity_m_s2` is absent if it was not measured."""
+    """A location on the Earth; `gravity_m_s2` is absent if it was not measured.
+
+    Examples
+    --------
+    >>> round(Site(latitude_deg=28.2, longitude_deg=113.0, height_m=60.0).gravity, 5)
+    9.79168
+    """
 
     format: Literal["imu50-site"] = "imu50-site"
     version: Literal[1] = 1
@@ -35,3 +42,8 @@ class Site(Model):
         if self.gravity_m_s2 is not None:
             return self.gravity_m_s2
         return normal_gravity(self.latitude_rad, self.height_m)
+
+    @property
+    def place(self) -> Place:
+        """The location as `imudrv.Navigator` takes it."""
+        return Place(self.latitude_rad, self.longitude_rad, self.height_m, self.gravity_m_s2)

@@ -3,18 +3,15 @@
 import argparse
 import os
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import import_module
+from importlib.metadata import version
 
 from imudrv.errors import InputError
 
 OK, OUR_FAULT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 """Exit codes."""
-
-
-_PATIENCE_S = 1.0
 
 
 def run_program(
@@ -42,13 +39,16 @@ def run_program(
     int
         Exit code, see `guarded`.
     """
-    arguments = sys.argv[1:] if argv is None else argv
+    return guarded(lambda: _run(package, description, commands, sys.argv[1:] if argv is None else argv))
+
+
+def _run(package: str, description: str, commands: Mapping[str, str], arguments: Sequence[str]) -> int | None:
     name = next((argument for argument in arguments if not argument.startswith("-")), None)
     program = package.partition(".")[0]
     parser = argparse.ArgumentParser(
         prog=program, description=description, epilog=f"example: {program} {next(iter(commands))} --help"
     )
-    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
+    parser.add_argument("--version", action="version", version=f"{program} {version('imu50')}")
     subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
     module = None
     for command, text in commands.items():
@@ -58,17 +58,8 @@ def run_program(
             subparser.epilog = f"example: {program} {command} {module.EXAMPLE}".rstrip()
             module.add_arguments(subparser)
     parsed = parser.parse_args(arguments)
-    return guarded(lambda: module.run(parsed) if module else None)
-
-
-class _Version(argparse.Action):
-    """Prints the version; looked up only when asked for."""
-
-    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
-        from importlib.metadata import version
-
-        sys.stdout.write(f"{parser.prog} {version('imu50')}\n")
-        parser.exit()
+    code: int | None = module.run(parsed) if module else None
+    return code
 
 
 def guarded(command: Callable[[], int | None]) -> int:
@@ -82,11 +73,12 @@ def guarded(command: Callable[[], int | None]) -> int:
     Returns
     -------
     int
-        The command's exit code, 0 if it has none; 2 for an error of the user; 130 after Ctrl-C; 1 for a
-        defect of this product, reported with its place in the code.
+        The command's exit code, 0 if it has none or stops because nobody reads its output; 2 for an error
+        of the user; 130 after Ctrl-C; 1 for a defect of this product, reported with its place in the code.
     """
+    code = OK
     try:
-        code = command()
+        code = command() or OK
         if sys.stdout is not None:  # None: the process was started with it closed
             sys.stdout.flush()
     except InputError as error:
@@ -98,14 +90,13 @@ def guarded(command: Callable[[], int | None]) -> int:
     except BrokenPipeError:
         # The reader of the output has gone, as `head` does; Python must not flush it again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return OK
     except Exception as error:
         from traceback import format_tb
 
         place = "".join(format_tb(error.__traceback__)[-2:])
         _complain(f"internal error, please report it: {type(error).__name__}: {error}\n{place}")
         return OUR_FAULT
-    return code or OK
+    return code
 
 
 def _complain(text: str) -> None:
@@ -115,7 +106,7 @@ def _complain(text: str) -> None:
 
 @contextmanager
 def progress(title: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Show a progress bar on a terminal once the work has taken a second; elsewhere nothing.
+    """Show a progress bar on a terminal; elsewhere nothing.
 
     Parameters
     ----------
@@ -136,17 +127,6 @@ def progress(title: str, total: int) -> Iterator[Callable[[int], None]]:
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
     columns = TextColumn(title), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
-    bar = Progress(*columns, console=Console(stderr=True), transient=True)
-    task = bar.add_task(title, total=total)
-    begun = time.monotonic()
-
-    def advance(amount: int) -> None:
-        bar.advance(task, amount)
-        if not bar.live.is_started and time.monotonic() - begun > _PATIENCE_S:
-            bar.start()
-
-    try:
-        yield advance
-    finally:
-        if bar.live.is_started:
-            bar.stop()
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(title, total=total)
+        yield lambda amount: bar.advance(task, amount)

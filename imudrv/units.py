@@ -1,6 +1,10 @@
 """Conversion factors and constants; everything inside is in SI and radians.
 
 Multiply by a factor to convert to SI (``30.0 * ARCSEC`` is in rad), divide to convert from SI.
+
+>>> from imudrv.units import ARCSEC, URAD
+>>> round(0.5 * ARCSEC / URAD, 3)  # half a second of arc in microradians
+2.424
 """
 
 from math import pi

@@ -7,6 +7,11 @@ from threading import Event, Thread
 from typing import TypeAlias
 
 import pytest
+from hypothesis import settings
+
+# The first example of a test may compile kernels, which takes seconds.
+settings.register_profile("imu50", deadline=None)
+settings.load_profile("imu50")
 
 _DATA = Path(__file__).parents[2] / "shared" / "data"
 ReplacedAtRandom: TypeAlias = Callable[..., AbstractContextManager[None]]

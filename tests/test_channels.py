@@ -64,14 +64,14 @@ def here(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize("log", ["two.log", "late.log"])
-def test_a_log_of_two_units_is_refused_by_every_command_however_late_the_second_comes(
+def test_a_log_of_two_units_is_refused_by_every_command_however_late_the_second_appears(
     command: str,
     log: str,
     here: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("imudrv.capture.CHUNK_BYTES", 4096)  # the log is read in 70 pieces
+    monkeypatch.setattr("imudrv.capture_files.source.CHUNK_BYTES", 4096)  # the log is read in 70 pieces
     main, before, after = COMMANDS[command]
     assert main([*before, log, *after]) == 2
     assert capsys.readouterr().err == f"error: {BOTH.replace('two.log', log)}--channel can0\n"
@@ -79,7 +79,7 @@ def test_a_log_of_two_units_is_refused_by_every_command_however_late_the_second_
 
 
 @pytest.mark.parametrize("channel", ["can0", "can1"])
-def test_the_chosen_unit_comes_out_as_from_a_log_of_its_own(
+def test_the_chosen_unit_is_decoded_as_from_a_separate_log(
     channel: str, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert imudrv(["decode", f"{channel}.log", *PROFILE, "-o", "out.npz"]) == 0
@@ -133,7 +133,7 @@ def test_a_channel_of_what_is_no_can_log_is_refused(
     service = ["run", "--port", "replay://can0.log?speed=max", *PROFILE, *CALIBRATION]
     service += ["--record", "unit.mcap", "--status", "status.sock"]
     if not Path("unit.mcap").exists():
-        subprocess.run([sys.executable, "-m", "imudrv", *service], check=True, timeout=120)
+        subprocess.run([sys.executable, "-m", "imudrv", *service], check=True, timeout=300)
     capsys.readouterr()
     main, before, after = COMMANDS[command]
     for name, profile, what in (
@@ -143,7 +143,7 @@ def test_a_channel_of_what_is_no_can_log_is_refused(
         arguments = [profile if a == "imu50-can" else a for a in after]
         assert main([*before, name, *arguments, "--channel", "can0"]) == 2
         message = capsys.readouterr().err
-        expected = f"error: {name}: --channel can0: expected a candump log, got {what}; leave --channel out\n"
+        expected = f"error: {name}: --channel can0: expected a CAN log, got {what}; leave --channel out\n"
         assert message == expected
 
 
@@ -154,7 +154,7 @@ def test_a_replay_of_two_units_is_refused_before_a_sample_is_served(here: Path) 
     assert (here / "out.csv").read_text() == ""
 
 
-def test_a_replay_serves_one_unit_until_the_second_one_comes(here: Path) -> None:
+def test_a_replay_serves_one_unit_until_the_second_one_appears(here: Path) -> None:
     done = serve("replay://late.log?speed=max")
     assert done.returncode == 2
     assert f"{BOTH.replace('two.log', 'late.log')}?channel=can0" in done.stderr
@@ -181,4 +181,4 @@ def serve(url: str) -> subprocess.CompletedProcess[str]:
     """Run the service to the end of a replay, with its increments in out.csv."""
     command = [sys.executable, "-m", "imudrv", "run", "--port", url, *PROFILE, *CALIBRATION]
     command += ["--out", "file:out.csv", "--status", "status.sock"]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)

@@ -127,7 +127,7 @@ def test_a_model_does_not_change() -> None:
         ("'<<'", "<<"),
     ],
 )
-def test_an_unquoted_value_is_what_yaml_1_2_says(file: Path, text: str, value: object) -> None:
+def test_an_unquoted_value_is_read_as_yaml_1_2_specifies(file: Path, text: str, value: object) -> None:
     file.write_text(f"content:\n  a: {text}\n")
     came = read(file, Free).content["a"]
     assert came == value
@@ -232,14 +232,14 @@ def test_a_fault_inside_a_list_has_its_index() -> None:
     )
 
 
-def test_an_unknown_key_brings_the_nearest_known_one() -> None:
+def test_an_unknown_key_is_reported_with_the_nearest_known_one() -> None:
     assert (
         fault(lines=[{"baudrate": 50, "paritty": 1}]) == "lines[0].paritty: unknown key; did you mean parity?"
     )
     assert faults_of({"bitrat": 1, "bitrate": 1}, Bus) == ("bitrat: unknown key; did you mean bitrate?",)
 
 
-def test_an_unknown_key_like_no_other_brings_all_known_ones() -> None:
+def test_an_unknown_key_without_a_similar_one_is_reported_with_all_known_ones() -> None:
     assert fault(lines=[{"baudrate": 50, "zz": 1}]) == "lines[0].zz: unknown key; known are baudrate, parity"
 
 
@@ -291,7 +291,7 @@ def test_what_a_message_quotes_is_short_and_printable(value: object) -> None:
 # YAML that is refused
 
 
-def test_a_syntax_error_tells_line_and_column(file: Path) -> None:
+def test_a_syntax_error_is_reported_with_line_and_column(file: Path) -> None:
     assert "1 fault\n  line 3, column 6: expected YAML, got: " in faults_in(file, "a: 1\nb: [1,\nc: 2]]\n")
 
 
@@ -321,7 +321,7 @@ def test_deep_nesting_is_refused_not_recursed(file: Path, opening: str) -> None:
     assert "nesting" in faults_in(file, opening * 10_000)
 
 
-def test_the_deepest_nesting_that_is_said_to_be_allowed_is(file: Path) -> None:
+def test_the_documented_depth_of_nesting_is_accepted(file: Path) -> None:
     levels = yaml_text.MAX_DEPTH - 2  # two mappings stand around the lists
     file.write_text(f"content: {{a: {'[' * levels}{']' * levels}}}")
     assert read(file, Free)
@@ -406,7 +406,7 @@ def test_a_file_without_permission_is_reported(file: Path, monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("path", ["a\0b", "x" * 5000, "/dev/null/x"])
-def test_a_path_that_cannot_be_is_reported(path: str) -> None:
+def test_an_impossible_path_is_reported(path: str) -> None:
     with pytest.raises(InputError, match="cannot be read: "):
         read(path, Settings)
     with pytest.raises(InputError, match="cannot be written: "):
@@ -526,7 +526,7 @@ def test_text_stays_text(file: Path, text: str) -> None:
     assert read(file, Free).content == {"a": text, "b": [text]}
 
 
-def test_a_written_file_reads_well(file: Path) -> None:
+def test_a_written_file_is_readable_by_people(file: Path) -> None:
     document = {
         "when": "2026-11-22T10:00:00Z",
         "lines": [{"parity": "even", "baudrate": 9600}],

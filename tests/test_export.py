@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from imudrv import profiles
+from imudrv.cli import main
 from imudrv.errors import InputError
-from imudrv.recording.export import KINDS, export
+from imudrv.recording.export import KINDS, export, export_datagrams
 from imudrv.recording.reader import Recording
 from imudrv.records import INCREMENTS, MESSAGE, PULSES, Arrival, Records, Source
 from imudrv.sinks.base import Batch
@@ -64,7 +65,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 def test_tables_have_the_recorded_increments_to_the_bit(recorded: Recording, tmp_path: Path) -> None:
     expected = samples()
     for kind in ("csv", "npz"):
-        assert export(recorded, kind, tmp_path / f"out.{kind}") == (SAMPLES, 2)
+        export(recorded, kind, tmp_path / f"out.{kind}")
     table = np.load(tmp_path / "out.npz")
     assert sorted(table) == ["counter", "dtheta", "dv", "flags", "interval_ns", "t_ns"]
     rows = np.genfromtxt(tmp_path / "out.csv", delimiter=",", names=True, dtype=None)
@@ -77,9 +78,27 @@ def test_tables_have_the_recorded_increments_to_the_bit(recorded: Recording, tmp
             assert np.array_equal(rows[f"{name}_{axis}"], expected[f"{name}_b"][:, k])
 
 
+def test_a_file_of_datagrams_becomes_the_same_table(
+    recorded: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sent = encode(np.concatenate(list(recorded.increments())), Source.SIMULATOR)
+    source = tmp_path / "out.i50n"
+    source.write_bytes(sent + sent[:40])  # cut
+    export(recorded, "csv", tmp_path / "recording.csv")
+    export_datagrams(source, "csv", tmp_path / "file.csv")
+    assert (tmp_path / "file.csv").read_bytes() == (tmp_path / "recording.csv").read_bytes()
+    assert main(["export", str(source), "--to", "npz", "-o", str(tmp_path / "file.npz")]) == 0
+    assert len(np.load(tmp_path / "file.npz")["counter"]) == SAMPLES
+    source.write_bytes(sent[:76] + b"x" + sent)
+    for kind, message in (("csv", "byte 76: expected I50N datagrams"), ("imr", "expected csv or npz")):
+        assert main(["export", str(source), "--to", kind, "-o", str(tmp_path / "bad.csv")]) == 2
+        assert message in capsys.readouterr().err
+    assert not (tmp_path / "bad.csv").exists()
+
+
 def test_raw_is_the_bytes_of_the_wire(recorded: Recording, tmp_path: Path) -> None:
     expected = b"".join(bytes([n, 255 - n]) * (n + 1) for n in range(50))
-    assert export(recorded, "raw", tmp_path / "out.raw") == (len(expected), 0)
+    export(recorded, "raw", tmp_path / "out.raw")
     assert (tmp_path / "out.raw").read_bytes() == expected
 
 
@@ -90,7 +109,7 @@ def test_candump_has_every_message(tmp_path: Path) -> None:
     messages["data"][:, :8] = np.arange(320).reshape(40, 8) % 256
     arrivals = [Arrival(BEGIN_NS, piece) for piece in np.split(messages, 8)]
     recording = record(tmp_path / "run.mcap", "imu50-can", arrivals, samples()[:0])
-    assert export(recording, "candump", tmp_path / "out.log") == (40, 0)
+    export(recording, "candump", tmp_path / "out.log")
     decoded, rejects = CandumpDecoder().feed((tmp_path / "out.log").read_bytes())
     assert rejects.size == 0
     assert np.array_equal(decoded, messages)
@@ -101,7 +120,7 @@ def test_candump_has_every_message(tmp_path: Path) -> None:
 
 def test_imr_reads_back_by_its_manual_and_its_sums_do_not_drift(recorded: Recording, tmp_path: Path) -> None:
     path = tmp_path / "out.imr"
-    assert export(recorded, "imr", path) == (SAMPLES, 2)
+    export(recorded, "imr", path)
     data = path.read_bytes()
     assert len(data) == 512 + 32 * SAMPLES
     # Field by field at the offsets of NovAtel's table, packed.
@@ -141,10 +160,26 @@ def test_imr_refuses_an_increment_that_it_cannot_hold(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["run.mcap"]
 
 
+def test_axes_that_a_unit_lacks_are_no_numbers_in_ros2_and_have_no_place_in_imr(tmp_path: Path) -> None:
+    increments = samples()[:5]
+    increments["dtheta_b"][:, 1:] = np.nan
+    increments["dv_b"] = np.nan
+    recording = record(tmp_path / "run.mcap", "fog-fg333", [], increments)
+    with pytest.raises(InputError, match=r"angle increments of all three axes.* export to csv or npz"):
+        export(recording, "imr", tmp_path / "out.imr")
+    reader = pytest.importorskip("mcap_ros2.reader")
+    export(recording, "ros2", tmp_path / "ros2.mcap")
+    for message in reader.read_ros2_messages(str(tmp_path / "ros2.mcap"), log_time_order=False):
+        imu = message.ros_msg
+        assert not np.isnan(imu.angular_velocity.x)
+        assert np.isnan([imu.angular_velocity.y, imu.angular_velocity.z]).all()
+        assert (imu.angular_velocity_covariance[0], imu.linear_acceleration_covariance[0]) == (0, -1)
+
+
 def test_ros2_has_rates_over_each_samples_own_interval(recorded: Recording, tmp_path: Path) -> None:
     reader = pytest.importorskip("mcap_ros2.reader")
     path = tmp_path / "ros2.mcap"
-    assert export(recorded, "ros2", path) == (SAMPLES, 2)
+    export(recorded, "ros2", path)
     expected = samples()
     count = 0
     for n, message in enumerate(reader.read_ros2_messages(str(path), log_time_order=False)):
@@ -167,7 +202,7 @@ def test_ros2_names_the_package_that_it_needs(recorded: Recording, tmp_path: Pat
         export(recorded, "ros2", tmp_path / "out.mcap")
 
 
-def test_a_kind_that_there_is_not_is_refused(recorded: Recording, tmp_path: Path) -> None:
+def test_an_unknown_kind_is_refused(recorded: Recording, tmp_path: Path) -> None:
     with pytest.raises(
         InputError, match="--to: expected one of csv, npz, raw, candump, imr, ros2, got 'mat'"
     ):
@@ -179,5 +214,5 @@ def test_a_kind_that_there_is_not_is_refused(recorded: Recording, tmp_path: Path
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "candump"])
 def test_a_recording_without_a_sample_is_exported_too(kind: str, tmp_path: Path) -> None:
     recording = record(tmp_path / "run.mcap", "imu50-rs422", [], samples()[:0])
-    assert export(recording, kind, tmp_path / f"out.{kind}") == (0, 0)
+    export(recording, kind, tmp_path / f"out.{kind}")
     assert (tmp_path / f"out.{kind}").exists()

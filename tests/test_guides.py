@@ -2,7 +2,8 @@
 
 A fenced block names what the test does with it: ``sh`` is pasted, ``sh live`` runs until the guide ends,
 ``sh status`` is repeated until samples flow, ``sh hardware`` needs a unit, ``sh long`` minutes and
-``python live`` a terminal of its own (none is run), ``yaml NAME`` is written to a file.
+``python live`` a terminal of its own (none is run), ``yaml NAME.yaml`` and ``python NAME.py`` are written to
+a file.
 """
 
 import os
@@ -10,20 +11,27 @@ import re
 import signal
 import subprocess
 import sys
+import textwrap
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any, get_args
 
 import pytest
+from realtime import DEADLINE_S
+
+from imudrv.files.model import Model
+from imudrv.profiles.schema import Profile
 
 TOP = Path(__file__).resolve().parents[1]
 GUIDES = sorted((TOP / "tools" / "guides").glob("*.md"))
 BLOCK = re.compile(r"^```(\w+)(?: ([\w.-]+))?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-DEADLINE_S = 240.0
 FLOWING = (0, 3)
 """Exit codes of `imudrv status` while samples flow: ok, and warning."""
-KINDS = {"sh": {"", "live", "status", "hardware", "long"}, "python": {"", "live"}}
+KINDS = {"sh": {"", "live", "status", "hardware", "long"}, "python": {"", "live"}, "yaml": {""}}
+KEY = re.compile(r"^\| `([\w.]+)` \|.*\| ([^|]*) \|[^|]*\|$", re.MULTILINE)
+"""Row of the table of all keys: path and default."""
 
 
 @pytest.fixture
@@ -60,8 +68,9 @@ def pasted(text: str, folder: Path) -> subprocess.CompletedProcess[str]:
 @pytest.mark.parametrize("guide", GUIDES, ids=lambda guide: guide.stem)
 def test_the_commands_of_a_guide_work_in_their_order(guide: Path, shell: Path) -> None:
     with ExitStack() as live:
-        for language, kind, text in BLOCK.findall(guide.read_text()):
-            if language == "yaml" and kind:
+        # Names in /tmp are the same for whoever runs this beside it.
+        for language, kind, text in BLOCK.findall(guide.read_text().replace("/tmp/", f"{shell}/")):
+            if "." in kind:
                 (shell / kind).write_text(text)
             elif (language, kind) == ("sh", "live"):
                 live.enter_context(running(text, shell))
@@ -77,7 +86,36 @@ def test_the_commands_of_a_guide_work_in_their_order(guide: Path, shell: Path) -
 @pytest.mark.parametrize("guide", GUIDES, ids=lambda guide: guide.stem)
 def test_each_block_of_a_guide_says_what_to_do_with_it(guide: Path) -> None:
     for language, kind, _ in BLOCK.findall(guide.read_text()):
-        assert language == "yaml" or kind in KINDS[language], f"{language} {kind}"
+        assert "." in kind or kind in KINDS[language], f"{language} {kind}"
+
+
+def keys(model: type[Model], path: str = "") -> Iterator[tuple[str, str]]:
+    """Yield the path and the default of each key of a model, and of the models inside."""
+    for name, field in model.model_fields.items():
+        default = "-" if field.default in (None, ()) else str(field.default)
+        yield f"{path}{name}", "required" if field.is_required() else default.replace("False", "false")
+        for inner in models(field.annotation):
+            yield from keys(inner, f"{path}{name}.")
+
+
+def models(annotation: Any) -> Iterator[type[Model]]:
+    if isinstance(annotation, type) and issubclass(annotation, Model):
+        yield annotation
+    for argument in get_args(annotation):
+        yield from models(argument)
+
+
+def test_the_guide_of_profiles_has_each_key_with_its_default() -> None:
+    table = (TOP / "tools" / "guides" / "profiles.md").read_text().partition("## All keys")[2]
+    assert dict(KEY.findall(table)) == dict(keys(Profile))
+
+
+def test_what_check_prints_is_in_the_guide(shell: Path) -> None:
+    guide = (TOP / "tools" / "guides" / "profiles.md").read_text()
+    (profile,) = (text for _, kind, text in BLOCK.findall(guide) if kind == "tern.yaml")
+    (shell / "tern.yaml").write_text(profile)
+    done = pasted("imudrv check tern.yaml", shell)
+    assert textwrap.indent(done.stdout, "    ") in guide
 
 
 def test_the_readme_is_short_and_its_links_lead_somewhere() -> None:

@@ -11,14 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from realtime import DEADLINE_S, free_port
 
 from imudrv.records import INCREMENTS, Flag, Records, Source
 from imudrv.wire.datagram import SIZE, encode
 
 TOOLS = Path(__file__).parents[1] / "tools"
 STRICT = ("-Wall", "-Wextra", "-Werror", "-std=c99", "-pedantic")
-WAIT_S = 20.0
-"""So long a process may take on a busy machine before a test fails."""
 
 # ICD, section 7.
 WORKED = bytes.fromhex(
@@ -90,9 +89,7 @@ class Running:
     """A receiver that listens, and somebody who sends to it."""
 
     def __init__(self, program: Path, *arguments: str, quiet: bool = False) -> None:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            probe.bind(("127.0.0.1", 0))
-            self._address = probe.getsockname()
+        self._address = "127.0.0.1", free_port()
         options = ["-q"] if quiet else []
         self._process = subprocess.Popen(
             [program, *options, str(self._address[1]), *arguments],
@@ -110,7 +107,7 @@ class Running:
     def lines(self, interrupt: bool = False) -> list[str]:
         if interrupt:
             self._process.send_signal(signal.SIGINT)
-        out, _ = self._process.communicate(timeout=WAIT_S)
+        out, _ = self._process.communicate(timeout=DEADLINE_S)
         assert self._process.returncode == 0
         return out.splitlines()
 
@@ -180,7 +177,7 @@ def test_lost_and_damaged_samples_are_counted(running: Start) -> None:
     assert one.lines() == ["received 23, lost 9, bad 2"]
 
 
-def test_a_unit_that_begins_anew_has_lost_nothing(running: Start) -> None:
+def test_a_restarted_unit_has_lost_nothing(running: Start) -> None:
     sent = increments(30)
     sent["counter"] = [*range(1000, 1020), *range(10)]
     one = running("30", quiet=True)
@@ -202,14 +199,16 @@ def test_an_interrupt_ends_it_with_the_summary(running: Start) -> None:
 @pytest.mark.parametrize(
     "arguments", [[], ["0"], ["port"], ["65536"], ["5005", "0"], ["5005", "1", "2"], ["-q"]]
 )
-def test_a_wrong_call_says_how_it_is_called(receiver: Path, arguments: list[str]) -> None:
-    run = subprocess.run([receiver, *arguments], check=False, capture_output=True, text=True, timeout=WAIT_S)
+def test_a_wrong_call_prints_the_usage(receiver: Path, arguments: list[str]) -> None:
+    run = subprocess.run(
+        [receiver, *arguments], check=False, capture_output=True, text=True, timeout=DEADLINE_S
+    )
     assert (run.returncode, run.stderr) == (2, "usage: i50n_receiver [-q] PORT [COUNT]\n")
 
 
 def result(program: Path, data: bytes) -> str:
     return subprocess.run(
-        [program], input=data, check=True, capture_output=True, timeout=WAIT_S
+        [program], input=data, check=True, capture_output=True, timeout=DEADLINE_S
     ).stdout.decode()
 
 
@@ -236,12 +235,12 @@ def test_the_worked_datagram_of_the_icd_is_decoded(decode: Path) -> None:
         (WORKED[:-1] + b"\0", "I50N_BAD_CRC"),
     ],
 )
-def test_what_is_no_datagram_says_why(decode: Path, data: bytes, name: str) -> None:
+def test_an_invalid_datagram_is_reported_with_the_reason(decode: Path, data: bytes, name: str) -> None:
     assert result(decode, data) == number(name)
 
 
 @pytest.mark.parametrize("at", range(5, SIZE, 7))
-def test_one_changed_bit_is_seen(decode: Path, at: int) -> None:
+def test_one_changed_bit_is_detected(decode: Path, at: int) -> None:
     damaged = bytearray(WORKED)
     damaged[at] ^= 1 << at % 8
     assert result(decode, bytes(damaged)) == number("I50N_BAD_CRC")

@@ -2,25 +2,15 @@
 
 import os
 import re
-import time
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
+from realtime import until
+
 from imudrv.service.printer import LIMIT, Printer
 
-DEADLINE_S = 60.0
 
-
-def until(true: Callable[[], object], what: str) -> None:
-    """Wait for something that must come; the deadline only ends a broken test."""
-    end = time.monotonic() + DEADLINE_S
-    while not true():
-        assert time.monotonic() < end, f"waited in vain: {what}"
-        time.sleep(0.01)
-
-
-def test_lines_come_out_in_order_and_whole(tmp_path: Path) -> None:
+def test_lines_are_printed_complete_and_in_order(tmp_path: Path) -> None:
     with (tmp_path / "text").open("w", encoding="ascii") as text:
         with Printer(text) as printer:
             for n in range(LIMIT):
@@ -30,7 +20,7 @@ def test_lines_come_out_in_order_and_whole(tmp_path: Path) -> None:
     assert (tmp_path / "text").read_text().splitlines() == [f"{n} \\xb5" for n in range(LIMIT)]
 
 
-def test_an_output_that_takes_nothing_costs_the_oldest_lines_and_says_how_many() -> None:
+def test_a_blocked_output_loses_the_oldest_lines_and_reports_their_number() -> None:
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
     with suppress(BlockingIOError):

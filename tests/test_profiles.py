@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,13 +24,14 @@ def stream_profile(**changes: object) -> dict[str, object]:
     """A small serial profile of another laboratory, to be changed."""
     document: dict[str, object] = {
         "format": "imu50-profile",
-        "version": 1,
+        "version": 2,
         "name": "another",
         "transport": "serial",
         "line": {"baudrate": 230400, "parity": "even"},
         "sample_rate_hz": 400,
         "byte_order": "big",
-        "counts": "increment",
+        "gyro": {"values": "increment", "unit": "pulse"},
+        "accelerometer": {"values": "increment", "unit": "pulse"},
         "nominal": {"gyro_arcsec_per_pulse": 1.0, "accelerometer_pulse_per_m_s": 1000.0},
         "messages": [message(3, "i24", "u8", {"kind": "sum", "width": 16})],
     }
@@ -52,7 +54,7 @@ def message(sync_bytes: int, pulse: str, counter: str, check: dict[str, object] 
     made: dict[str, object] = {"sync": "AA 55 0D"[: 3 * sync_bytes - 1], "fields": fields}
     if check:
         size = int(str(check["width"])) // 8
-        made["check"] = {"first": 0, "last": at - 1, "offset": at, **check}
+        made["checks"] = [{"covers": [[0, at - 1]], "offset": at, **check}]
         at += size
     return made | {"length": at}
 
@@ -79,7 +81,10 @@ INVENTED = {
         ],
     ),
     "2 kHz, totals of 32 bits, 24-bit counter, 8-bit sum": stream_profile(
-        sample_rate_hz=2000, counts="total", messages=[message(2, "u32", "u24", {"kind": "sum", "width": 8})]
+        sample_rate_hz=2000,
+        gyro={"values": "total", "unit": "pulse"},
+        accelerometer={"values": "total", "unit": "pulse"},
+        messages=[message(2, "u32", "u24", {"kind": "sum", "width": 8})],
     ),
     "100 Hz, 8-bit pulses, 32-bit counter, no check": stream_profile(
         sample_rate_hz=100, messages=[message(3, "i8", "u32", None)]
@@ -115,8 +120,9 @@ def test_the_worked_frame_of_the_icd_decodes_to_its_numbers() -> None:
     assert frame["status"] == 1
 
 
-def test_all_four_profiles_ship_with_the_line_and_rate_of_the_icd() -> None:
-    lines = {name: profiles.load(name).line for name in profiles.shipped()}
+def test_the_profiles_of_the_icd_ship_with_its_line_and_rate() -> None:
+    assert set(profiles.OWN) <= set(profiles.shipped())
+    lines = {name: profiles.load(name).line for name in profiles.OWN}
     assert {name: line.model_dump(exclude_none=True) for name, line in lines.items()} == {
         "imu50-rs422": {"baudrate": 921600, "bytesize": 8, "parity": "none", "stopbits": 1},
         "imu50-rs422-acc": {"baudrate": 460800, "bytesize": 8, "parity": "none", "stopbits": 1},
@@ -129,7 +135,7 @@ def test_all_four_profiles_ship_with_the_line_and_rate_of_the_icd() -> None:
 @pytest.mark.parametrize("document", INVENTED.values(), ids=INVENTED.keys())
 def test_an_invented_profile_works_by_path_without_code(document: dict[str, object], tmp_path: Path) -> None:
     layout = profiles.load(written(tmp_path, document)).layout()
-    span = 1 << layout.counter_bits
+    span = 1 << layout.sequence.bits
     sent = some_pulses(layout, 3000, first=span - 1000)  # across the counter's wrap
     wire = StreamEncoder(layout).encode(sent).tobytes()
     decoder, tracker = StreamDecoder(layout), SequenceTracker(layout)
@@ -149,7 +155,23 @@ def test_an_invented_profile_works_by_path_without_code(document: dict[str, obje
     assert tracker.counts.closes
 
 
-def test_a_profile_tells_all_its_faults_at_once(tmp_path: Path) -> None:
+@pytest.mark.parametrize("document", INVENTED.values(), ids=INVENTED.keys())
+def test_a_profile_of_version_1_means_the_same(document: dict[str, Any], tmp_path: Path) -> None:
+    one = {key: value for key, value in document.items() if key not in ("gyro", "accelerometer")}
+    one |= {"version": 1, "counts": document["gyro"]["values"], "messages": []}
+    for message in document["messages"]:
+        parts = {key: value for key, value in message.items() if key != "checks"}
+        for check in message.get("checks", []):
+            ((first, last),) = check["covers"]
+            parts["check"] = {k: v for k, v in check.items() if k != "covers"} | {
+                "first": first,
+                "last": last,
+            }
+        one["messages"].append(parts)
+    assert profiles.load(written(tmp_path, one)) == profiles.load(written(tmp_path, document))
+
+
+def test_all_faults_of_a_profile_are_reported_at_once(tmp_path: Path) -> None:
     document = stream_profile(byte_order="middle", sample_rate_hz=0, colour="red")
     with pytest.raises(FaultyFileError) as caught:
         profiles.load(written(tmp_path, document))
@@ -160,17 +182,17 @@ def test_a_profile_tells_all_its_faults_at_once(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"messages": [message(3, "u24", "u8", None)]}, "signed pulse increments"),
+        ({"messages": [message(3, "u24", "u8", None)]}, "expected a signed type"),
         ({"transport": "can"}, "bitrate"),
         ({"messages": [message(3, "i24", "u8", None) | {"length": 10}]}, "within 10 bytes"),
         ({"messages": [message(3, "i24", "u8", None) | {"sync": "AA 55 0D 01"}]}, "inside sync"),
         ({"messages": [message(3, "i24", "i8", None)]}, "unsigned"),
-        ({"sample_rate_hz": 300}, "whole nanoseconds"),
+        ({"sample_rate_hz": [1, 2]}, "sample_rate_hz: expected 1 to 100000, got 0.5"),
         ({"messages": [message(3, "i24", "u8", {"kind": "crc", "width": 16})]}, "polynomial"),
         (
             {
                 "messages": [
-                    message(3, "i24", "u8", {"kind": "sum", "width": 8, "offset": 5, "first": 0, "last": 9})
+                    message(3, "i24", "u8", {"kind": "sum", "width": 8, "offset": 5, "covers": [[0, 9]]})
                 ]
             },
             "inside",
@@ -178,13 +200,21 @@ def test_a_profile_tells_all_its_faults_at_once(tmp_path: Path) -> None:
         ({"status_bits": [{"bit": 1, "name": "a", "means": "fault"}] * 2}, "each bit once"),
     ],
 )
-def test_a_profile_that_makes_no_sense_is_refused_with_the_reason(
+def test_an_invalid_profile_is_refused_with_the_reason(
     change: dict[str, object], said: str, tmp_path: Path
 ) -> None:
     with pytest.raises(FaultyFileError, match=said):
         profiles.load(written(tmp_path, stream_profile(**change)))
 
 
+@pytest.mark.parametrize("name", profiles.shipped())
+def test_a_shipped_profile_is_of_its_name_and_says_where_it_is_from(name: str) -> None:
+    assert profiles.load(name).name == name
+    comment = profiles.content(name).decode().partition("format:")[0]
+    assert comment.startswith("# ")
+    assert "ICD" in comment if name in profiles.OWN else "Not tried on hardware" in comment
+
+
 def test_an_unknown_profile_names_the_shipped_ones() -> None:
-    with pytest.raises(InputError, match="imu50-rs422-acc"):
+    with pytest.raises(InputError, match=r"imu50-rs422-acc.*imudrv profiles"):
         profiles.load("imu51")

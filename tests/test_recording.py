@@ -13,10 +13,12 @@ from samples import CERTIFICATE, record
 
 from imudrv import profiles
 from imudrv.errors import FaultyFileError, InputError
+from imudrv.recording import reader
 from imudrv.recording.format import pack_messages, unpack_messages
 from imudrv.recording.pack import pack
 from imudrv.recording.reader import Recording
-from imudrv.records import MESSAGE, Arrival
+from imudrv.records import MESSAGE, Arrival, Source, Timebase
+from imudrv.sinks.recorder import Recorder
 
 PROFILES = Path(profiles.__file__).parent
 
@@ -49,7 +51,7 @@ def contents(recording: Recording) -> tuple[list[object], ...]:
     )
 
 
-def test_everything_that_was_recorded_comes_back(recorded: Path) -> None:
+def test_everything_recorded_is_read_again(recorded: Path) -> None:
     recording = Recording(recorded)
     assert not recording.cut
     assert recording.profile == profiles.load("imu50-rs422")
@@ -116,7 +118,7 @@ def test_chunks_of_any_compression_are_read(
 
 def test_packing_makes_it_smaller_and_changes_nothing(recorded: Path, tmp_path: Path) -> None:
     path = tmp_path / "packed.mcap"
-    assert pack(recorded, path) == (33, False)
+    pack(recorded, path)
     assert path.stat().st_size < recorded.stat().st_size
     assert not Recording(path).cut
     assert contents(Recording(path)) == contents(Recording(recorded))
@@ -138,7 +140,8 @@ def test_a_cut_recording_is_packed_up_to_its_cut_and_in_place(recorded: Path, tm
     path = tmp_path / "run.mcap"
     path.write_bytes(recorded.read_bytes()[:-900])
     before = contents(Recording(path))
-    assert pack(path, path).cut
+    assert Recording(path).cut
+    pack(path, path)
     assert not Recording(path).cut
     assert contents(Recording(path)) == before
     assert [p.name for p in tmp_path.iterdir()] == ["run.mcap"]
@@ -210,6 +213,68 @@ def test_an_attachment_that_was_changed_is_reported(recorded: Path, tmp_path: Pa
         _ = Recording(path).profile
 
 
+def can_recording(path: Path, reads: int) -> list[Arrival]:
+    """Record reads of CAN messages of all lengths, and changes of the timebase between them."""
+    rng, name = np.random.default_rng(3), "imu50-can"
+    recorder = Recorder(
+        path,
+        layout=profiles.load(name).layout(),
+        profile=profiles.content(name),
+        calibration=None,
+        source=Source.SIMULATOR,
+        port="sim://x.yaml",
+        unit="",
+    )
+    arrivals = []
+    for n in range(reads):
+        messages = np.zeros(rng.integers(1, 5), MESSAGE)
+        messages["t_ns"], messages["length"] = 1000 + n, rng.choice([0, 6, 8, 64], len(messages))
+        messages["data"] = rng.integers(0, 256, (len(messages), 64))
+        messages["data"][np.arange(64) >= messages["length"][:, None]] = 0
+        arrivals.append(Arrival(1000 + n, messages, Timebase(n // 7, 0)))
+        recorder.arrived(arrivals[-1])
+    recorder.close()
+    return arrivals
+
+
+@pytest.mark.parametrize("size", [1, 50, 100, 333, 1 << 18])
+def test_reads_are_the_same_whatever_of_the_file_is_in_memory(
+    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: int
+) -> None:
+    monkeypatch.setattr(reader, "_BUFFER_BYTES", size)
+    assert list(Recording(recorded).arrivals()) == [Arrival(1000 + n, b"%044d" % n) for n in range(30)]
+    path = tmp_path / "can.mcap"
+    arrivals = can_recording(path, 40)
+    found = list(Recording(path).arrivals())
+    assert [(a.t_ns, a.timebase) for a in found] == [(a.t_ns, a.timebase) for a in arrivals]
+    for one, other in zip(found, arrivals, strict=True):
+        assert np.array_equal(one.data, other.data)
+
+
+def test_reads_before_a_damaged_one_come_before_the_error(tmp_path: Path) -> None:
+    path = tmp_path / "can.mcap"
+    can_recording(path, 40)
+    content = bytearray(path.read_bytes())
+    at = [place for place in places_of(content, 5) if content[place + 9] == 1][23]
+    content[at + 31] = 65  # the length of the data
+    path.write_bytes(content)
+    arrivals = Recording(path).arrivals()
+    assert [next(arrivals).t_ns for _ in range(23)] == list(range(1000, 1023))
+    with pytest.raises(InputError, match=rf"at byte {at}: expected CAN messages of at most 64 bytes"):
+        next(arrivals)
+
+
+@pytest.mark.parametrize("damage", [0x00, 0x80])
+def test_a_time_that_no_clock_has_is_reported(recorded: Path, tmp_path: Path, damage: int) -> None:
+    content = bytearray(recorded.read_bytes())
+    at = places_of(content, 5)[3]
+    content[at + 31 - 9] = 0x40 + damage  # the upper byte of its time
+    path = tmp_path / "bad.mcap"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=rf"at byte {at}: expected a time up to"):
+        list(Recording(path).arrivals())
+
+
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_whatever_is_damaged_it_is_read_or_reported(
@@ -242,5 +307,9 @@ def test_can_messages_pack_and_unpack(pieces: list[list[tuple[int, int]]]) -> No
             row["t_ns"], row["id"], row["length"], row["fd"] = -identifier, identifier, length, length > 8
             row["data"][:length] = np.arange(length) + identifier % 100
         arrays.append(messages)
-    for messages, packed in zip(arrays, pack_messages(arrays), strict=True):
-        assert np.array_equal(unpack_messages(packed), messages)
+    packed = pack_messages(arrays)
+    ends = np.cumsum([len(piece) for piece in packed])
+    messages, message_ends, fault = unpack_messages(np.frombuffer(b"".join(packed), np.uint8), ends)
+    assert fault == ""
+    assert np.array_equal(messages, np.concatenate(arrays))
+    assert message_ends.tolist() == np.cumsum([len(messages) for messages in arrays]).tolist()

@@ -1,5 +1,8 @@
+import json
 import os
 import pty
+import subprocess
+import sys
 import tty
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -14,7 +17,7 @@ from imudrv.profiles import load
 from imudrv.records import PULSES
 from imudrv.service.loop import POLL_NS, Service
 from imudrv.service.settings import Settings
-from imudrv.service.status import Status
+from imudrv.service.status import Status, UnitStatus
 from imudrv.service.status_socket import StatusServer, ask
 from imudrv.sim.scenario import NOMINAL
 from imudrv.units import NS_PER_S
@@ -98,3 +101,41 @@ def test_a_status_of_another_version_is_refused(tmp_path: Path) -> None:
     server.close()
     with pytest.raises(InputError, match=r"socket: expected imu50-status version 1, got b'.*\"version\": 2"):
         answer.result()
+
+
+@pytest.mark.parametrize("options", [[], ["--json"]])
+def test_the_exit_code_of_the_health_survives_a_reader_that_has_gone(
+    tmp_path: Path, options: list[str]
+) -> None:
+    events = ["one of the many lines of a long status"] * 1000  # more than a buffer holds
+    document = {"format": "imu50-status", "version": 1, "health": "fail", "reasons": [], "events": events}
+    server = StatusServer(tmp_path / "socket")
+    reader, writer = os.pipe()
+    os.close(reader)  # as `head` does when it has its lines
+    command = [sys.executable, "-m", "imudrv", "status", "--status", str(server.path), *options]
+    process = subprocess.Popen(command, stdout=writer, stderr=subprocess.PIPE)
+    os.close(writer)
+    while process.poll() is None:
+        server.poll(json.dumps(document).encode() + b"\n")
+    server.close()
+    _, errors = process.communicate()
+    assert (process.returncode, errors) == (4, b"")
+
+
+@pytest.mark.parametrize(
+    ("profile", "word", "bits", "faults"),
+    [
+        ("imu50-rs422", 0b11, ["warm-up", "gyro X fault"], ["gyro X fault"]),
+        ("kvh1775", 0x77, [], []),
+        (
+            "kvh1775",
+            0x36,
+            ["gyro X invalid", "accelerometer Z invalid"],
+            ["gyro X invalid", "accelerometer Z invalid"],
+        ),
+    ],
+)
+def test_a_bit_that_means_good_is_a_fault_while_it_is_clear(
+    profile: str, word: int, bits: list[str], faults: list[str]
+) -> None:
+    assert UnitStatus.of(word, load(profile).layout()) == UnitStatus(word, bits, faults)

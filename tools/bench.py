@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""How fast the product is, each stage beside what a user would otherwise write.
+"""Measure the speed of each stage, compared with what a user would otherwise write.
 
     tools/run python tools/bench.py [--rounds N] [--json]
     tools/run python tools/bench.py live [--seconds N] [--rounds N] [--json]
     tools/run python tools/bench.py nav [--rounds N] [--json]
 
-A capture with damage in it goes through all stages, piece by piece, in one process on one core. The machine
-and its other work change the figures; the ratios are the message.
+A capture with damaged frames passes all stages, piece by piece, in one process on one core. Absolute figures
+depend on the machine and its load; the ratios are what to look at.
 """
 
 import argparse
@@ -18,26 +18,30 @@ import platform
 import struct
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
+from itertools import islice
+from math import inf
 from typing import Final
 
 import numba
 import numpy as np
 from bench_live import live
-from bench_nav import nav
+from bench_nav import Measure, nav
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
 from imudrv.imu.coefficients import Coefficients
 from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import rate_filter
 from imudrv.imu.sequence import SequenceTracker
 from imudrv.profiles import load
 from imudrv.records import PULSES, Flag, Records
+from imudrv.sim.capture import wire
 from imudrv.sim.faults import StreamFaults
 from imudrv.sim.scenario import Faults, StreamRates
+from imudrv.sim.scenario import load as load_scenario
 from imudrv.units import ARCSEC, DEG_PER_H, UG
+from imudrv.wire.decoder import FrameDecoder
 from imudrv.wire.encode import StreamEncoder
 from imudrv.wire.stream import StreamDecoder
 
@@ -46,16 +50,21 @@ Array = NDArray[np.float64]
 LAYOUT: Final = load("imu50-rs422").layout()
 TAU: Final = 1e-3
 PIECE: Final = 4096
-"""Samples at a time: what one stage makes is still in the cache when the next one reads it."""
+"""Samples a piece: the output of a stage is still in the cache when the next one reads it."""
 SAMPLES: Final = 80 * PIECE
-"""Length of the capture; twelve rounds are more than an hour."""
+"""Length of the capture; twelve rounds are more than an hour of samples."""
 OTHER_ROUNDS: Final = 3
-"""Rounds of the other ways."""
+"""Rounds of the alternatives."""
 SLOW_SAMPLES: Final = 16 * PIECE
-"""Part of it that the loop in Python gets."""
+"""Part of the capture that the loop in Python decodes."""
 DAMAGE: Final = StreamRates(
     bit_flips=0.004, bytes_lost=0.004, bytes_inserted=0.004, false_sync_between=0.004, frame_lost=0.004
 )
+OTHERS: Final = (
+    ("kvh1775", "f32 and a counter of 7 bits", "imu50-rs422"),
+    ("bosch-mm7", "bit fields, three messages", "imu50-can"),
+)
+"""Profiles of other makers, what is in them, and the profile of our unit on the same kind of line."""
 CALIBRATION: Final = Coefficients(
     gyro_scale=np.array([0.45, 0.76, 0.85]) * ARCSEC,
     gyro_bias=np.array([0.2, -0.3, 0.1]) * DEG_PER_H,
@@ -67,29 +76,12 @@ CALIBRATION: Final = Coefficients(
 )
 
 
-@dataclass(frozen=True)
-class Measure:
-    """One stage beside the other way to do it, in samples a second."""
-
-    stage: str
-    samples: int
-    per_second: float
-    other_way: str
-    other_samples: int
-    other_per_second: float
-
-    @property
-    def ratio(self) -> float:
-        """How many times quicker than the other way."""
-        return self.per_second / self.other_per_second
-
-
 def capture(samples: int) -> list[bytes]:
-    """Pieces of a damaged capture of a unit that turns and shakes."""
+    """Return the pieces of a damaged capture with random pulses."""
     random = np.random.default_rng(1)
     encoder = StreamEncoder(LAYOUT)
-    header = bytes(value for _, value in LAYOUT.messages[0].constants)
-    line = StreamFaults(Faults(stream=DAMAGE), header, seed=3)
+    (message,) = LAYOUT.messages
+    line = StreamFaults(Faults(stream=DAMAGE), [(message.length, message.header)], seed=3)
     pieces = []
     for first in range(0, samples, PIECE):
         pulses = np.zeros(min(PIECE, samples - first), PULSES)
@@ -103,7 +95,7 @@ def capture(samples: int) -> list[bytes]:
 
 
 def best_seconds(run: Callable[[], object], rounds: int) -> float:
-    """Shortest of several runs: what disturbs them only ever adds."""
+    """Return the shortest of several runs: disturbances only add time."""
     seconds = []
     for _ in range(rounds):
         begin = time.perf_counter()
@@ -113,12 +105,12 @@ def best_seconds(run: Callable[[], object], rounds: int) -> float:
 
 
 def plain_decode(data: bytes) -> list[tuple[int, ...]]:
-    """Search, check and unpack frame by frame, one byte on after a bad one."""
+    """Search, check and unpack frame by frame; after a bad frame move on by one byte."""
     frames = []
     at = data.find(b"\xeb\x90\x50\x26")
     while 0 <= at <= len(data) - 44:
-        (stands,) = struct.unpack_from("<H", data, at + 42)
-        if binascii.crc_hqx(data[at + 2 : at + 42], 0xFFFF) == stands:
+        (crc,) = struct.unpack_from("<H", data, at + 42)
+        if binascii.crc_hqx(data[at + 2 : at + 42], 0xFFFF) == crc:
             frames.append(struct.unpack_from("<I6i4hH", data, at + 4))
             at += 44
         else:
@@ -128,7 +120,7 @@ def plain_decode(data: bytes) -> list[tuple[int, ...]]:
 
 
 def plain_account(frames: Records) -> tuple[Records, int]:
-    """Pulses and number of lost samples; blind to disorder, duplicates, invalid counters and restarts."""
+    """Return pulses and number of lost samples; ignores disorder, duplicates and restarts."""
     steps = np.diff(frames["counter"], prepend=frames["counter"][0] - 1) % 2**32
     status = LAYOUT.status
     fault = frames["status"] & status.fault != 0
@@ -157,29 +149,29 @@ def plain_account(frames: Records) -> tuple[Records, int]:
 
 
 def plain_compensate(pulses: Records, c: Coefficients) -> tuple[Array, Array]:
-    """Section 1 of the mathematics over whole arrays, blind to gaps, long intervals and chunk ends."""
+    """Compensate whole arrays (section 1 of the mathematics); ignores gaps, long intervals and chunk ends."""
     assert c.r_b is not None
     a_b = np.linalg.inv(c.C_ba)
     dtheta_b = (pulses["gyro"] * c.gyro_scale) @ c.C_bg.T - c.gyro_bias * TAU
-    felt_a = pulses["accelerometer"] / c.accelerometer_scale - c.accelerometer_bias * TAU
+    dv_a = pulses["accelerometer"] / c.accelerometer_scale - c.accelerometer_bias * TAU
     w1 = np.zeros_like(dtheta_b)
     w1[2:] = (2.0 * dtheta_b[:-2] - 7.0 * dtheta_b[1:-1] + 11.0 * dtheta_b[2:]) / (6.0 * TAU)
     w0 = np.vstack([np.zeros(3), w1[:-1]])
     wm = dtheta_b / TAU
     for i, (a, r) in enumerate(zip(a_b, c.r_b, strict=True)):
-        turned = [np.cross(w, np.cross(w, r)) for w in (w0, wm, w1)]
-        integral = np.cross(w1 - w0, r) + TAU / 6.0 * (turned[0] + 4.0 * turned[1] + turned[2])
-        felt_a[:, i] -= integral @ a
-    return dtheta_b, felt_a @ c.C_ba.T
+        start, middle, end = (np.cross(w, np.cross(w, r)) for w in (w0, wm, w1))
+        integral = np.cross(w1 - w0, r) + TAU / 6.0 * (start + 4.0 * middle + end)
+        dv_a[:, i] -= integral @ a
+    return dtheta_b, dv_a @ c.C_ba.T
 
 
 def throughput(rounds: int) -> list[Measure]:
-    """Measure decoding, accounting and compensation, and see that both ways agree.
+    """Measure decoding, accounting and compensation; both implementations must agree.
 
     Parameters
     ----------
     rounds : int
-        How often each stage goes over the capture.
+        Number of passes over the capture.
 
     Returns
     -------
@@ -188,13 +180,12 @@ def throughput(rounds: int) -> list[Measure]:
     """
     pieces = capture(SAMPLES)
     some = b"".join(pieces[: SLOW_SAMPLES // PIECE])
-    causal = rate_filter("causal", LAYOUT.interval_ns)
 
-    # Each stage once: warms its kernels and gives the next one its input.
+    # Run each stage once: compiles its kernels and makes the input of the next one.
     decoder, tracker = StreamDecoder(LAYOUT), SequenceTracker(LAYOUT)
     frames = [decoder.feed(piece).frames for piece in pieces]
     pulses = [tracker.feed(piece) for piece in frames]
-    increments = Compensator(CALIBRATION, LAYOUT, causal).feed(pulses[0])
+    increments = Compensator(CALIBRATION, LAYOUT).feed(pulses[0])
     count = sum(map(len, frames))
 
     by_loop = plain_decode(some)
@@ -210,9 +201,9 @@ def throughput(rounds: int) -> list[Measure]:
     assert np.allclose(increments["dv_b"][3:unbroken], dv_b[3:], rtol=0.0, atol=1e-14)
 
     def flow() -> tuple[float, float, float]:
-        """Go over the capture once, piece by piece through all stages; seconds of each."""
+        """Pass the capture through all stages, piece by piece; return the seconds of each."""
         decoder, tracker = StreamDecoder(LAYOUT), SequenceTracker(LAYOUT)
-        compensator = Compensator(CALIBRATION, LAYOUT, causal)
+        compensator = Compensator(CALIBRATION, LAYOUT)
         decoding = accounting = compensating = 0.0
         for piece in pieces:
             begin = time.perf_counter()
@@ -244,8 +235,31 @@ def throughput(rounds: int) -> list[Measure]:
     ]
 
 
+def decode_of_others(rounds: int) -> list[Measure]:
+    """Measure the decoder with profiles of other makers against those of our unit, in alternating rounds."""
+    measures = []
+    for name, kind, own in OTHERS:
+        layouts = [load(name).layout(), load(own).layout()]
+        captures = [
+            [piece.data for piece in islice(wire(load_scenario("static"), layout, PIECE), SAMPLES // PIECE)]
+            for layout in layouts
+        ]
+        seconds = [inf, inf]
+        for _ in range(rounds):
+            for k, (layout, pieces) in enumerate(zip(layouts, captures, strict=True)):
+                decoder = FrameDecoder(layout)
+                begin = time.perf_counter()
+                count = sum(len(decoder.feed(piece)) for piece in pieces)
+                seconds[k] = min(seconds[k], time.perf_counter() - begin)
+                assert count + len(decoder.close()) == SAMPLES
+        theirs, ours = (SAMPLES / each for each in seconds)
+        stage, samples = f"decode {name}: {kind}", rounds * SAMPLES
+        measures.append(Measure(stage, samples, theirs, f"decode {own}", samples, ours))
+    return measures
+
+
 def machine() -> dict[str, str | int]:
-    """Kind of machine and of software."""
+    """Describe machine and software."""
     return {
         "machine": platform.machine(),
         "cpus": os.cpu_count() or 0,
@@ -257,10 +271,10 @@ def machine() -> dict[str, str | int]:
 
 
 def show(measures: list[Measure], how: str) -> None:
-    """Print a table, and how it was measured."""
+    """Print a table and the conditions of the measurement."""
     console = Console()
     console.print(", ".join(f"{name} {value}" for name, value in machine().items()))
-    table = Table("stage", "M samples/s", "the other way", "M samples/s", "times")
+    table = Table("stage", "M samples/s", "alternative", "M samples/s", "ratio")
     for column in (table.columns[1], table.columns[3], table.columns[4]):
         column.justify = "right"
     for m in measures:
@@ -268,21 +282,21 @@ def show(measures: list[Measure], how: str) -> None:
         table.add_row(m.stage, ours, m.other_way, theirs, f"{m.ratio:.1f}")
     console.print(table)
     counts = ", ".join(f"{m.samples / 1e6:.1f} M and {m.other_samples / 1e6:.1f} M" for m in measures)
-    console.print(f"One core, {how}, the best round. Samples of each line: {counts}.")
+    console.print(f"One core, {how}, best round. Samples, own and alternative: {counts}.")
 
 
 def show_live(quantiles: dict[str, dict[str, float]]) -> None:
     """Print a table."""
-    table = Table("from the unit's write to the receiver", *quantiles["ratio"])
+    table = Table("latency from unit to receiver", *quantiles["ratio"])
     for which, row in quantiles.items():
         table.add_row(which, *(f"{x:.2f}" if which == "ratio" else f"{x * 1e6:.0f} us" for x in row.values()))
     Console().print(table)
 
 
 def main() -> None:
-    """Measure and tell."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--json", action="store_true", help="numbers for a machine instead of a table")
+    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
     parser.add_argument(
         "what",
         nargs="?",
@@ -295,7 +309,9 @@ def main() -> None:
         type=int,
         help="default: 12 over 5.4 minutes of samples; live 3 of each; nav 5 over an hour",
     )
-    parser.add_argument("--seconds", type=int, default=20, help="of a live round (default: %(default)s)")
+    parser.add_argument(
+        "--seconds", type=int, default=20, help="duration of a live round (default: %(default)s)"
+    )
     options = parser.parse_args()
     rounds = options.rounds or {"stages": 12, "live": 3, "nav": 5}[options.what]
     if rounds < 1 or options.seconds < 1:
@@ -310,13 +326,12 @@ def main() -> None:
     how, extra = f"{PIECE:,} samples at a time", {}
     if options.what == "nav":
         if importlib.util.find_spec("pyins") is None:
-            parser.exit(2, "bench.py nav: expected python-ins, to compare with: pip install python-ins\n")
-        timings, peak_mb = nav(rounds)
-        measures = [Measure(*timing) for timing in timings]
-        how = f"an hour in the pieces of a capture, a row a second, {peak_mb:.0f} MB of memory at the most"
+            parser.exit(2, "bench.py nav: expected python-ins for the comparison: pip install python-ins\n")
+        measures, peak_mb = nav(rounds)
+        how = f"an hour in the pieces of a capture, a row a second, peak memory {peak_mb:.0f} MB"
         extra = {"peak_mb": peak_mb}
     else:
-        measures = throughput(rounds)
+        measures = throughput(rounds) + decode_of_others(rounds)
     if options.json:
         rows = [{**asdict(m), "ratio": m.ratio} for m in measures]
         print(json.dumps({"machine": machine(), "measures": rows, **extra}, indent=1))

@@ -1,8 +1,8 @@
-"""How late samples come through the live service, beside a loop that only forwards bytes.
+"""Latency of the live service, compared with a loop that only forwards bytes.
 
-A player writes frames into a pty at 1 kHz, a receiver takes what comes out by UDP; both read the same clock.
-Between them runs either the service, or `select`, `os.read` and `sendto` with nothing in between: what the
-system itself takes. The two take turns, so that the machine's moods hit both.
+A player writes frames to a pty at 1 kHz and a receiver takes them by UDP; both read the same clock. Between
+them runs either the service or a bare loop of `select`, `os.read` and `send`, whose latency is that of the
+operating system. The two alternate, so that other load of the machine affects both.
 """
 
 import os
@@ -32,7 +32,7 @@ LAYOUT: Final = load("imu50-rs422").layout()
 FRAME: Final = LAYOUT.messages[0].length
 TAU_S: Final = 1e-3
 SETTLE: Final = 500
-"""Samples at the beginning that do not count: caches, branch predictors and the scheduler find their way."""
+"""Samples at the start that are ignored, while caches, branch predictors and the scheduler settle."""
 BARE: Final = """
 import gc, os, select, socket, sys
 path, port = sys.argv[1], int(sys.argv[2])
@@ -50,7 +50,7 @@ while True:
 
 
 def play(master: int, sent_ns: NDArray[np.int64]) -> None:
-    """Write one frame each millisecond; note when."""
+    """Write a frame each millisecond and store the time."""
     pulses = np.zeros(len(sent_ns), PULSES)
     pulses["counter"] = np.arange(len(sent_ns))
     pulses["temperature_degc"] = 35.0
@@ -62,8 +62,8 @@ def play(master: int, sent_ns: NDArray[np.int64]) -> None:
         os.write(master, frame)
 
 
-def receive(inlet: socket.socket, counter_at: int, size: int, came_ns: NDArray[np.int64]) -> None:
-    """Note when each sample comes, until a second of silence."""
+def receive(inlet: socket.socket, counter_at: int, size: int, received_ns: NDArray[np.int64]) -> None:
+    """Store the time at which each sample arrives, until none does for 2 s."""
     inlet.settimeout(2.0)
     buffer = bytearray(65536)
     while True:
@@ -74,12 +74,12 @@ def receive(inlet: socket.socket, counter_at: int, size: int, came_ns: NDArray[n
         now = time.monotonic_ns()
         for at in range(0, length, size):
             counter = int.from_bytes(buffer[at + counter_at : at + counter_at + 4], "little")
-            if counter < len(came_ns):
-                came_ns[counter] = now
+            if counter < len(received_ns):
+                received_ns[counter] = now
 
 
 def one_round(samples: int, service: bool, folder: Path) -> NDArray[np.float64]:
-    """Play samples through one of the two; seconds that each took."""
+    """Play samples through service or bare loop; return the latency of each, s."""
     master, slave = pty.openpty()
     tty.setraw(slave)
     path = os.ttyname(slave)
@@ -96,12 +96,12 @@ def one_round(samples: int, service: bool, folder: Path) -> NDArray[np.float64]:
     middle = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
     assert middle.stdout is not None
     middle.stdout.readline()
-    came_ns = np.zeros(samples, np.int64)
+    received_ns = np.zeros(samples, np.int64)
     listener = os.fork()
     if listener == 0:
         with frozen_gc():
-            receive(inlet, *((8, SIZE) if service else (4, FRAME)), came_ns)
-        np.save(folder / "came.npy", came_ns)
+            receive(inlet, *((8, SIZE) if service else (4, FRAME)), received_ns)
+        np.save(folder / "received.npy", received_ns)
         os._exit(0)
     sent_ns = np.zeros(samples, np.int64)
     with frozen_gc():
@@ -112,25 +112,27 @@ def one_round(samples: int, service: bool, folder: Path) -> NDArray[np.float64]:
     inlet.close()
     os.close(master)
     os.close(slave)
-    came_ns = np.load(folder / "came.npy")
-    lost = int(np.count_nonzero(came_ns == 0))
+    received_ns = np.load(folder / "received.npy")
+    lost = int(np.count_nonzero(received_ns == 0))
     if lost:
-        raise SystemExit(f"{'service' if service else 'bare loop'}: {lost} of {samples} samples did not come")
-    return (came_ns - sent_ns)[SETTLE:] * 1e-9
+        raise SystemExit(
+            f"{'service' if service else 'bare loop'}: {lost} of {samples} samples did not arrive"
+        )
+    return (received_ns - sent_ns)[SETTLE:] * 1e-9
 
 
 def live(seconds: int, rounds: int) -> dict[str, dict[str, float]]:
-    """Measure both in turns.
+    """Measure both alternately.
 
     Parameters
     ----------
     seconds, rounds : int
-        Length of a round, and how many of each.
+        Duration of a round, and number of rounds of each.
 
     Returns
     -------
     dict
-        Seconds of each quantile, and the ratios.
+        Quantiles of the latency, s, and their ratios.
     """
     taken: dict[str, list[NDArray[np.float64]]] = {"bare loop": [], "service": []}
     with tempfile.TemporaryDirectory() as name:

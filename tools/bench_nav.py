@@ -1,13 +1,14 @@
-"""How fast an hour of wire bytes becomes velocity and its measurement matrices, beside python-ins (pyins).
+"""Speed from wire bytes to velocity and its measurement matrices, compared with python-ins (pyins).
 
-The capture repeats two simulated half turns: they end as they began, and the size effect of the second one
-undoes that of the first. python-ins takes the same increments, decoded and compensated already, in one go as
-its documentation shows; it integrates attitude, velocity and place and knows nothing like H.
+The capture repeats two simulated half turns, which end as they began; the size effect of the second cancels
+that of the first. python-ins gets the same increments, already decoded and compensated, in one array as in
+its documentation; it integrates attitude, velocity and position and has no equivalent of H.
 """
 
 import resource
 import tempfile
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -19,7 +20,6 @@ from imudrv.calibration import coefficients
 from imudrv.capture import Capture
 from imudrv.files.settings_file import parse
 from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import rate_filter
 from imudrv.nav.attitude import quaternion_of_matrix
 from imudrv.nav.mechanisation import Navigator
 from imudrv.profiles import load
@@ -52,16 +52,17 @@ SCENARIO: Final = parse(
 REPEATS: Final = 180
 """An hour."""
 EVERY: Final = 1000
-"""Samples a row of velocity and matrices."""
+"""Samples per row of velocity and matrices."""
 OTHER_REPEATS: Final = 15
-"""Part of the hour that python-ins gets: it keeps all it makes, some 400 bytes a sample."""
+"""Part of the hour that python-ins integrates: it keeps its output, some 400 bytes a sample."""
 STAGES: Final = ("capture to velocity, H, B, P, Q", "navigate, with H, B, P, Q", "navigate, without")
 OTHER: Final = "python-ins, no H"
 KNOWN: Final = coefficients(NOMINAL.without_size_effect())
 
 
-class Timing(NamedTuple):
-    """One stage beside the other way, in samples a second."""
+@dataclass(frozen=True)
+class Measure:
+    """Speed of a stage and of its alternative, samples a second."""
 
     stage: str
     samples: int
@@ -70,21 +71,26 @@ class Timing(NamedTuple):
     other_samples: int
     other_per_second: float
 
+    @property
+    def ratio(self) -> float:
+        """Speed of the stage over that of the alternative."""
+        return self.per_second / self.other_per_second
+
 
 class Hour(NamedTuple):
-    """What was measured."""
+    """Result of the measurement."""
 
-    timings: list[Timing]
-    peak_mb: float  # resident memory of the process up to the end of the first stage's first round
+    measures: list[Measure]
+    peak_mb: float  # resident memory after the first pass from capture to matrices
 
 
 def nav(rounds: int) -> Hour:
-    """Measure the way from a capture to H, and navigation alone.
+    """Measure the processing from a capture to H, and navigation alone.
 
     Parameters
     ----------
     rounds : int
-        How often each is done; the best counts.
+        Number of rounds; the best counts.
 
     Returns
     -------
@@ -94,14 +100,14 @@ def nav(rounds: int) -> Hour:
         path = Path(folder) / "hour.raw"
         q_nb = _write(path)
         count = path.stat().st_size // LAYOUT.messages[0].length
-        _through(path, q_nb)
+        _process(path, q_nb)
         peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
         pieces = _period(path)
         other = PythonIns(np.concatenate(pieces), q_nb)
-        # in turns, so that the machine's moods hit all of them
+        # alternately, so that other load of the machine affects all
         seconds = [
             (
-                _through(path, q_nb),
+                _process(path, q_nb),
                 _navigate(pieces, q_nb, matrices=True),
                 _navigate(pieces, q_nb, matrices=False),
                 other.integrate(),
@@ -111,7 +117,7 @@ def nav(rounds: int) -> Hour:
     *ours, theirs = np.min(seconds, axis=0).tolist()
     return Hour(
         [
-            Timing(stage, count * rounds, count / best, OTHER, other.count * rounds, other.count / theirs)
+            Measure(stage, count * rounds, count / best, OTHER, other.count * rounds, other.count / theirs)
             for stage, best in zip(STAGES, ours, strict=True)
         ],
         peak_mb,
@@ -119,8 +125,8 @@ def nav(rounds: int) -> Hour:
 
 
 def _write(path: Path) -> NDArray[np.float64]:
-    """Write an hour of wire bytes; the attitude at its start."""
-    chunks = list(simulate(SCENARIO, LAYOUT.interval_ns))
+    """Write an hour of wire bytes; return the attitude at its start."""
+    chunks = list(simulate(SCENARIO, LAYOUT))
     pulses = np.concatenate([chunk.pulses for chunk in chunks])
     first = pulses["counter"].copy()
     encoder = StreamEncoder(LAYOUT)
@@ -132,15 +138,15 @@ def _write(path: Path) -> NDArray[np.float64]:
 
 
 def _compensator() -> Compensator:
-    return Compensator(KNOWN, LAYOUT, rate_filter("causal", LAYOUT.interval_ns))
+    return Compensator(KNOWN, LAYOUT)
 
 
 def _navigator(q_nb: NDArray[np.float64], *, matrices: bool) -> Navigator:
-    return Navigator.from_site(SCENARIO.site, q_nb, C_ba=KNOWN.C_ba if matrices else None, every=EVERY)
+    return Navigator(SCENARIO.site.place, q_nb, C_ba=KNOWN.C_ba if matrices else None, every=EVERY)
 
 
-def _through(path: Path, q_nb: NDArray[np.float64]) -> float:
-    """Seconds from the capture to the matrices, piece by piece."""
+def _process(path: Path, q_nb: NDArray[np.float64]) -> float:
+    """Return the seconds from the capture to the matrices, piece by piece."""
     navigator = _navigator(q_nb, matrices=True)
     begin = time.perf_counter()
     for increments in Capture(path, PROFILE).increments(_compensator(), lambda _: None):
@@ -149,8 +155,8 @@ def _through(path: Path, q_nb: NDArray[np.float64]) -> float:
 
 
 def _period(path: Path) -> list[Records]:
-    """Increments of the first two half turns, in the pieces that a capture gives."""
-    pieces, wanted = [], samples(SCENARIO, LAYOUT.interval_ns)
+    """Return the increments of the first two half turns, in the pieces of the capture."""
+    pieces, wanted = [], samples(SCENARIO, LAYOUT.interval)
     for increments in Capture(path, PROFILE).increments(_compensator(), lambda _: None):
         pieces.append(increments[:wanted])
         wanted -= len(pieces[-1])
@@ -160,7 +166,7 @@ def _period(path: Path) -> list[Records]:
 
 
 def _navigate(pieces: list[Records], q_nb: NDArray[np.float64], *, matrices: bool) -> float:
-    """Seconds of navigation over the hour."""
+    """Return the seconds of navigation over the hour."""
     navigator = _navigator(q_nb, matrices=matrices)
     begin = time.perf_counter()
     for _ in range(REPEATS):
@@ -170,19 +176,19 @@ def _navigate(pieces: list[Records], q_nb: NDArray[np.float64], *, matrices: boo
 
 
 class PythonIns:
-    """python-ins on the same increments; sees to it that both navigate alike.
+    """python-ins on the same increments; both must give the same velocity.
 
     Parameters
     ----------
     period : ndarray of INCREMENTS
-        Repeated by it.
+        Repeated `OTHER_REPEATS` times.
     q_nb : ndarray, shape (4,)
-        Attitude at the start.
+        Attitude at the start, scalar first.
 
     Attributes
     ----------
     count : int
-        Samples that it integrates.
+        Number of samples integrated.
     """
 
     def __init__(self, period: Records, q_nb: NDArray[np.float64]) -> None:
@@ -197,22 +203,22 @@ class PythonIns:
         C_nb = Rotation.from_quat(np.roll(q_nb, -1)).as_matrix()
         swap = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]])  # east, north, up and north, east, down
         heading, pitch, roll = Rotation.from_matrix(swap @ C_nb @ swap).as_euler("ZYX", degrees=True)
-        place = {"lat": site.latitude_deg, "lon": site.longitude_deg, "alt": site.height_m}
+        position = {"lat": site.latitude_deg, "lon": site.longitude_deg, "alt": site.height_m}
         rest = {"VN": 0.0, "VE": 0.0, "VD": 0.0, "roll": roll, "pitch": pitch, "heading": heading}
         self._strapdown = strapdown
         self._imu = pd.DataFrame(rows, index=t_s, columns=util.GYRO_COLS + util.ACCEL_COLS)
-        self._start = pd.Series({**place, **rest}, name=t_s[0])
+        self._start = pd.Series({**position, **rest}, name=t_s[0])
         self.count = len(rows)
 
-        told = self._integrated(len(period)).iloc[-1]  # compiles it, too
+        other = self._integrated(len(period)).iloc[-1]  # compiles it, too
         navigator = _navigator(q_nb, matrices=False)
         navigator.feed(period[1:])
         v_n = navigator.latest["v_n"][0]
-        # python-ins takes the rotation within a sample to second order, (2.4e-3)^2 / 6 of g, as the turn goes
-        assert np.allclose([told.VE, told.VN], v_n[:2], rtol=0.0, atol=1e-4), (told, v_n)
+        # python-ins has the rotation within a sample to second order only: an error of (2.4e-3)^2 / 6 of g
+        assert np.allclose([other.VE, other.VN], v_n[:2], rtol=0.0, atol=1e-4), (other, v_n)
 
     def integrate(self) -> float:
-        """Seconds that it takes."""
+        """Return the seconds of an integration."""
         begin = time.perf_counter()
         self._integrated(self.count)
         return time.perf_counter() - begin

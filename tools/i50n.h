@@ -1,5 +1,5 @@
 /*
- * I50N: the output datagram of the IMU50 driver, version 1. One header, C99 or C++, nothing else needed.
+ * I50N: the output datagram of the IMU50 driver, version 1. One header, C99 or C++, without dependencies.
  *
  *     struct i50n_sample sample;
  *     for (size_t at = 0; at < n; at += I50N_SIZE)
@@ -19,7 +19,7 @@
 #define I50N_VERSION 1
 #define I50N_SIZE 76 /* bytes a sample */
 
-/* Where each number begins, little-endian. */
+/* Offset of each number, little-endian. */
 #define I50N_AT_VERSION 4      /* u8, after the letters I50N */
 #define I50N_AT_SOURCE 5       /* u8 */
 #define I50N_AT_FLAGS 6        /* u16 */
@@ -40,8 +40,11 @@ enum i50n_flag {
     I50N_FAULT = 1 << 4,             /* a fault bit in the unit's status word */
     I50N_TEMPERATURE_RANGE = 1 << 5, /* outside of the calibrated range */
     I50N_SIZE_EFFECT = 1 << 6,       /* compensated */
-    I50N_CLOCK_UNLOCKED = 1 << 7,    /* t_ns is not to be trusted yet */
-    I50N_WARM_UP = 1 << 8
+    I50N_CLOCK_UNLOCKED = 1 << 7,    /* t_ns is not reliable yet */
+    I50N_WARM_UP = 1 << 8,
+    I50N_GAP_BY_HOST_TIME = 1 << 9,    /* the gap before this sample is known from host time only */
+    I50N_GAP_LENGTH_UNKNOWN = 1 << 10, /* more samples may be missing than the counter shows */
+    I50N_CLOCK_STEPPED = 1 << 11       /* the host's clock was set, or the host slept: t_ns may jump, also back */
 };
 
 enum i50n_result { I50N_OK = 0, I50N_TOO_SHORT, I50N_BAD_MAGIC, I50N_BAD_VERSION, I50N_BAD_CRC };
@@ -56,7 +59,7 @@ struct i50n_sample {
     uint8_t source;       /* of enum i50n_source */
 };
 
-/* What this header takes for granted fails to compile where it does not hold. */
+/* Assumptions of this header; where one is false it does not compile. */
 typedef char i50n_a_double_has_8_bytes[sizeof(double) == 8 ? 1 : -1];
 typedef char i50n_angles_fit[I50N_AT_DTHETA + 3 * sizeof(double) == I50N_AT_DV ? 1 : -1];
 typedef char i50n_velocities_fit[I50N_AT_DV + 3 * sizeof(double) == I50N_AT_CRC ? 1 : -1];

@@ -1,11 +1,11 @@
 /*
- * Receives I50N datagrams over UDP on the loopback and prints them: an example, and a test of the line.
+ * Receives I50N datagrams over UDP on the loopback and prints them: an example, and a test of the connection.
  *
  *     cc -O2 -std=c99 -o i50n_receiver i50n_receiver.c
  *     imudrv run ... --out udp://127.0.0.1:5005 &
  *     ./i50n_receiver [-q] PORT [COUNT]
  *
- * One line a sample: counter, interval_ns, t_ns, flags, dtheta X Y Z, dv X Y Z. With -q the summary alone.
+ * One line per sample: counter, interval_ns, t_ns, flags, dtheta X Y Z, dv X Y Z. With -q only the summary.
  * Ends after COUNT samples, or on Ctrl-C.
  */
 #define _POSIX_C_SOURCE 200809L
@@ -25,7 +25,7 @@
 
 static volatile sig_atomic_t stopped;
 
-struct books {
+struct counts {
     unsigned long long received, lost, bad;
     uint32_t next;
 };
@@ -48,8 +48,8 @@ static long long number(const char *text, long long low, long long high)
 
 static int listen_on(uint16_t port)
 {
-    const int queue = 1 << 22; /* the system's usual one holds a quarter of a second of single samples */
-    const struct timeval patience = {0, 200000}; /* then look whether to stop */
+    const int queue = 1 << 22; /* the usual default holds a quarter of a second of single samples */
+    const struct timeval timeout = {0, 200000}; /* then check whether to stop */
     struct sockaddr_in address;
     const int fd = socket(AF_INET, SOCK_DGRAM, 0);
     if (fd < 0)
@@ -59,7 +59,7 @@ static int listen_on(uint16_t port)
     address.sin_port = htons(port);
     address.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
     (void)setsockopt(fd, SOL_SOCKET, SO_RCVBUF, &queue, sizeof queue);
-    (void)setsockopt(fd, SOL_SOCKET, SO_RCVTIMEO, &patience, sizeof patience);
+    (void)setsockopt(fd, SOL_SOCKET, SO_RCVTIMEO, &timeout, sizeof timeout);
     if (bind(fd, (const struct sockaddr *)&address, sizeof address) != 0) {
         (void)close(fd);
         return -1;
@@ -74,17 +74,17 @@ static void print(const struct i50n_sample *s)
            s->dv_b[0], s->dv_b[1], s->dv_b[2]);
 }
 
-/* Count a sample and those lost before it. Up to 64 back it is late or came twice; farther, a unit began anew. */
-static void account(struct books *books, uint32_t counter)
+/* Count a sample and those lost before it. Up to 64 back it is late or repeated; farther, the unit has restarted. */
+static void count_sample(struct counts *counts, uint32_t counter)
 {
-    const uint32_t gap = counter - books->next;
-    const int started = books->received > 0;
-    books->received++;
+    const uint32_t gap = counter - counts->next;
+    const int started = counts->received > 0;
+    counts->received++;
     if (started && gap >= UINT32_MAX - 63)
         return;
     if (started && gap <= INT32_MAX)
-        books->lost += gap;
-    books->next = counter + 1;
+        counts->lost += gap;
+    counts->next = counter + 1;
 }
 
 int main(int argc, char **argv)
@@ -93,7 +93,7 @@ int main(int argc, char **argv)
     const int quiet = argc > 1 && strcmp(argv[1], "-q") == 0;
     char **argument = argv + 1 + quiet;
     const int arguments = argc - 1 - quiet;
-    struct books books = {0, 0, 0, 0};
+    struct counts counts = {0, 0, 0, 0};
     struct sigaction action;
     long long port = -1, count = INT64_MAX;
     int fd;
@@ -117,7 +117,7 @@ int main(int argc, char **argv)
     }
     fprintf(stderr, "listening on 127.0.0.1:%lld\n", port);
 
-    while (!stopped && books.received < (unsigned long long)count) {
+    while (!stopped && counts.received < (unsigned long long)count) {
         struct i50n_sample sample;
         size_t at, n;
         const ssize_t got = recv(fd, packet, sizeof packet, 0);
@@ -128,18 +128,18 @@ int main(int argc, char **argv)
             break;
         }
         n = (size_t)got;
-        for (at = 0; at < n && books.received < (unsigned long long)count; at += I50N_SIZE) {
+        for (at = 0; at < n && counts.received < (unsigned long long)count; at += I50N_SIZE) {
             if (i50n_decode(packet + at, n - at, &sample) != I50N_OK) {
-                books.bad++;
+                counts.bad++;
                 continue;
             }
-            account(&books, sample.counter);
+            count_sample(&counts, sample.counter);
             if (!quiet)
                 print(&sample);
         }
         fflush(stdout);
     }
     (void)close(fd);
-    printf("received %llu, lost %llu, bad %llu\n", books.received, books.lost, books.bad);
+    printf("received %llu, lost %llu, bad %llu\n", counts.received, counts.lost, counts.bad);
     return 0;
 }

@@ -1,4 +1,4 @@
-"""How well the inner lever arms are found: see `calib.validation.montecarlo`.
+"""Accuracy of the identified lever arms over simulated units: see `calib.validation.montecarlo`.
 
 tools/run python tools/montecarlo.py --cases 200
 tools/run python tools/montecarlo.py --budget slow --signs both --json
@@ -20,7 +20,7 @@ from calib.validation.montecarlo import BUDGETS, run_cases
 def main() -> None:
     """Run the cases and print their statistics."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--cases", type=int, default=200, help="how many (default: %(default)s)")
+    parser.add_argument("--cases", type=int, default=200, help="number of units (default: %(default)s)")
     parser.add_argument("--budget", choices=BUDGETS, default="standard", help="default: %(default)s")
     parser.add_argument("--signs", choices=("one", "both"), default="one", help="three rotations or six")
     parser.add_argument(
@@ -29,8 +29,8 @@ def main() -> None:
         default=Priors().skew * 1e3,
         help="gyro-accelerometer skew of the units, 1 sigma, and its prior; 0: none (default: %(default)s)",
     )
-    parser.add_argument("--seed", type=int, default=0, help="of the first case (default: %(default)s)")
-    parser.add_argument("--json", action="store_true", help="numbers for a machine instead of a table")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the first case (default: %(default)s)")
+    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
     options = parser.parse_args()
     if options.cases < 1:
         parser.error("--cases: expected 1 or more")

@@ -1,4 +1,4 @@
-"""Turn an IMU log of the PSINS toolbox (text, six integer increments a row) into wire bytes of a 100 Hz unit.
+"""Convert an IMU log of the PSINS toolbox (text, six integer increments a row) to wire bytes at 100 Hz.
 
 tools/run python tools/psins_to_wire.py lasergyro.imu -o lasergyro.raw
 tools/run imudrv decode lasergyro.raw --profile tools/psins-100hz.yaml -o lasergyro.npz
@@ -22,7 +22,7 @@ _CHUNK = 1 << 14
 
 
 def read(path: Path) -> Records:
-    """Increments of a log.
+    """Read the increments of a log.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ def read(path: Path) -> Records:
     Raises
     ------
     InputError
-        No such file, or not such a file.
+        The file cannot be read, or has another format.
     """
     try:
         lines = [
@@ -58,7 +58,7 @@ def read(path: Path) -> Records:
 
 
 def convert(source: Path, output: Path) -> None:
-    """Write the wire bytes of a log."""
+    """Convert a log to wire bytes."""
     encoder = StreamEncoder(profiles.load(str(PROFILE)).layout())
     pulses = read(source)
     with output.open("wb") as file:

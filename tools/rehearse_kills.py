@@ -1,11 +1,10 @@
-"""Rehearse the bench procedure and end it with kill -9 at random moments, resuming each time.
+"""Rehearse the bench procedure, kill it with SIGKILL at random moments, and resume it each time.
 
     python tools/rehearse_kills.py [--kills 30] [--seed 1] [FOLDER]
 
-Every third run has a terminal that accepts no output, as after Ctrl-S.
-
-At the end the session must verify, no accepted step may have been repeated, no sample logged twice, and the
-result must agree with that of an undisturbed rehearsal within three sigma of their difference.
+Every third run has a terminal that accepts no output, as after Ctrl-S. At the end the session must verify, no
+accepted step may be repeated, no sample logged twice, and the result must agree with that of an undisturbed
+rehearsal within three sigma of their difference.
 """
 
 import argparse
@@ -33,13 +32,13 @@ RUN: Final = (
     "run(RunOptions(Path(sys.argv[1]), rehearse=True, speed='max'), Console())"
 )
 PAUSE_S: Final = (3.0, 25.0)
-"""Shortest and longest life of a process; it takes a while to start."""
+"""Shortest and longest time before a kill; the start takes part of it."""
 
 
 def main() -> int:
     """Run the rehearsals and print the faults."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("folder", type=Path, nargs="?", help="where the two sessions go")
+    parser.add_argument("folder", type=Path, nargs="?", help="for the sessions (default: a temporary one)")
     parser.add_argument("--kills", type=int, default=30)
     parser.add_argument("--seed", type=int, default=1)
     arguments = parser.parse_args()
@@ -47,31 +46,31 @@ def main() -> int:
     folder.mkdir(parents=True, exist_ok=True)
     moments = random.Random(arguments.seed)
 
-    begun = time.monotonic()
+    begin = time.monotonic()
     rehearse(folder / "undisturbed")
-    print(f"undisturbed: {time.monotonic() - begun:.0f} s", flush=True)
+    print(f"undisturbed: {time.monotonic() - begin:.0f} s", flush=True)
     killed, kills, sessions = folder / "killed-1", 0, 1
     disturbed = []
     while kills < arguments.kills:
-        lived = moments.uniform(*PAUSE_S)
-        if rehearse(killed, lived, is_stopped=kills % 3 == 1):
+        lifetime_s = moments.uniform(*PAUSE_S)
+        if rehearse(killed, lifetime_s, is_stopped=kills % 3 == 1):
             disturbed.append(killed)
             sessions += 1
             killed = folder / f"killed-{sessions}"
         else:
             kills += 1
             lines = journal(killed)
-            print(f"kill {kills} after {lived:.1f} s: {killed.name}, {len(lines)} lines", flush=True)
+            print(f"kill {kills} after {lifetime_s:.1f} s: {killed.name}, {len(lines)} lines", flush=True)
     if killed.exists():
         rehearse(killed)
         disturbed.append(killed)
     faults = [fault for session in disturbed for fault in check(session, folder / "undisturbed")]
-    print("\n".join(faults) or f"{kills} kills over {len(disturbed)} sessions: all well")
+    print("\n".join(faults) or f"{kills} kills over {len(disturbed)} sessions, no fault")
     return 1 if faults else 0
 
 
 def rehearse(folder: Path, longest_s: float | None = None, is_stopped: bool = False) -> bool:
-    """Begin or resume a rehearsal, into a log or a stopped terminal; return whether it ended in time."""
+    """Start or resume a rehearsal with output to a log or a stopped terminal; return whether it finished."""
     with ExitStack() as opened:
         output: Any = opened.enter_context(open(f"{folder}.log", "a"))
         if is_stopped:
@@ -111,12 +110,12 @@ def check(folder: Path, undisturbed: Path) -> list[str]:
                 if (np.diff(log["counter"]) <= 0).any():
                     faults.append(f"{folder}: {entry['recording']}: a sample was logged twice")
         elif entry["event"] == "entered" and entry["phase"] == "place" and entry["step_id"] in done:
-            faults.append(f"{folder}: {entry['step_id']} was asked again")
+            faults.append(f"{folder}: {entry['step_id']} was requested again")
     (found, sigma), (expected, _) = sensing_points(folder), sensing_points(undisturbed)
     apart = np.abs(found - expected)
     print(f"{folder.name}: {apart.max() / MM:.4f} mm from undisturbed, {(apart / sigma).max():.2f} sigma")
     if (apart > 3.0 * 2.0**0.5 * sigma).any():
-        faults.append(f"{folder}: the result is not that of the undisturbed session")
+        faults.append(f"{folder}: the result differs from that of the undisturbed session")
     return faults
 
 

@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""Fingerprints of what the product computes: proof that a rewrite changes no bit of it.
+"""Compare the results of two versions bit for bit.
 
     python tools/same_bits.py --write before.json      on the old code
     python tools/same_bits.py --check before.json      on the new code
 
-Simulated captures of every profile, with line faults, are decoded, accounted for, compensated with each rate
-filter, stamped, and navigated with H; lever arms are identified and validated on clean ones. Each result has
-a SHA-256 under a name of its own. The order of columns counts, their names do not.
+Simulated captures of every profile, with line faults, are decoded, checked for sequence, compensated with
+each rate filter, stamped, and navigated with H; lever arms are identified and validated on clean ones. Each
+result has a name and a SHA-256. The order of columns counts, their names do not.
 
 Bits depend on the processor and on numpy, scipy and numba: a file belongs to one machine and is not
 committed. On another one `--check` refuses to compare.
@@ -38,12 +38,12 @@ from imudrv.calibration import Calibration, coefficients
 from imudrv.files.settings_file import parse
 from imudrv.imu.coefficients import Coefficients
 from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import NAMES, rate_filter
+from imudrv.imu.rate_filter import NAMES
 from imudrv.imu.sequence import SequenceTracker
 from imudrv.nav.alignment import Alignment
 from imudrv.nav.mechanisation import Navigator
 from imudrv.pipeline import Pipeline
-from imudrv.profiles import load, shipped
+from imudrv.profiles import OWN, load
 from imudrv.profiles.schema import Profile
 from imudrv.records import Records
 from imudrv.sim.capture import record, wire
@@ -76,10 +76,10 @@ UNIT: Final = {
     },
 }
 WHOLE: Final = parse(json.loads(NOMINAL.model_dump_json(exclude_none=True)) | UNIT, Calibration, "unit")
-HARM: Final = ("bit_flips", "bytes_lost", "bytes_inserted", "false_sync_inside", "frame_lost")
+DAMAGE: Final = ("bit_flips", "bytes_lost", "bytes_inserted", "false_sync_inside", "frame_lost")
 BETWEEN: Final = ("bytes_between", "false_sync_between", "frame_doubled")
 FAULTS: Final = {
-    "stream": dict.fromkeys(HARM + BETWEEN, 0.002),
+    "stream": dict.fromkeys(DAMAGE + BETWEEN, 0.002),
     "can": dict.fromkeys(["lost", "doubled", "swapped"], 0.002),
     "silences": [{"at_s": 36.0, "duration_s": 0.05}, {"at_s": 38.0, "duration_s": 0.7}],
     "counter_jumps": [{"at_s": 39.0, "by": 1000}, {"at_s": 40.0, "by": -30000}],
@@ -91,7 +91,7 @@ TESTS: Final = {"rotation": [TURN], "rocking": [ROCK], "vibration": [VIBRATE], "
 
 
 def main() -> int:
-    """Write or check; exit status 1: some results differ, 2: the file belongs to another machine."""
+    """Write or check; exit code 1: results differ, 2: the file is of another machine."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--write", type=Path, metavar="FILE", help="store the fingerprints of this code")
@@ -114,14 +114,14 @@ def main() -> int:
 
 
 def machine() -> str:
-    """Whatever else the bits depend on."""
+    """Describe processor and libraries, on which the bits depend."""
     cpu = f"{platform.system()} {platform.machine()} {llvmlite.binding.get_host_cpu_name()}"
     return ", ".join([cpu, *(f"{m.__name__} {m.__version__}" for m in (np, scipy, numba, llvmlite))])
 
 
 def results() -> Results:
-    """Name and hash of every result."""
-    for name in shipped():
+    """Yield name and hash of each result."""
+    for name in OWN:
         profile, run = load(name), scenario([ROCK], faults=FAULTS)
         for what, fingerprint in (*offline(profile, run), *live(profile, run)):
             yield f"{name}: {what}", fingerprint
@@ -142,7 +142,7 @@ def sha256(*arrays: Any) -> str:
 
 
 def scenario(motion: list[Any], *, pose: str = "z_up", faults: Any = None, residuals: Any = None) -> Scenario:
-    """Motion between two rests, of a unit that warms up and whose counter overflows."""
+    """Return a scenario of motion between two rests; the unit warms up and its counter overflows."""
     start = {"pose": pose, "tilt_mrad": [0.8, -0.5], "pivot_offset_mm": [40, 30, 30], "counter": 2**32 - 700}
     document = {
         "format": "imu50-scenario",
@@ -172,7 +172,7 @@ def pieces(whole: Any, longest: int) -> Iterator[Any]:
 
 
 def offline(profile: Profile, run: Scenario) -> Results:
-    """Take a capture through the steps one by one, each fed in pieces."""
+    """Process a capture stage by stage, each fed in pieces."""
     layout, full = profile.layout(), coefficients(WHOLE)
     capture = b"".join(data for data, _ in record(run, layout))
     yield "capture", hashlib.sha256(capture).hexdigest()
@@ -201,21 +201,21 @@ def offline(profile: Profile, run: Scenario) -> Results:
     q_nb = alignment.result().q_nb
     yield "align", sha256(q_nb)
     for what, C_ba in (("navigate", None), ("navigate with H", full.C_ba)):
-        navigator = Navigator(site.latitude_rad, site.longitude_rad, site.height_m, None, q_nb, C_ba=C_ba)
+        navigator = Navigator(site.place._replace(gravity_m_s2=None), q_nb, C_ba=C_ba)
         yield what, sha256(np.concatenate([navigator.feed(piece) for piece in pieces(rest, 3000)]))
 
 
 def compensated(profile: Profile, pulses: Records, c: Coefficients, filter_name: Any) -> Records:
-    """Increments of pulses that come in pieces."""
+    """Return the increments of pulses fed in pieces."""
     layout = profile.layout()
-    compensator = Compensator(c, layout, rate_filter(filter_name, layout.interval_ns))
+    compensator = Compensator(c, layout, filter_name)
     return np.concatenate([*map(compensator.feed, pieces(pulses, 1500)), compensator.close()])
 
 
 def live(profile: Profile, run: Scenario) -> Results:
-    """Feed bursts that arrive late by a random time, on a host whose clock gains 20 ppm."""
+    """Feed bursts that arrive with random delays, on a host whose clock gains 20 ppm."""
     rng, layout = np.random.default_rng(6), profile.layout()
-    pipeline = Pipeline(profile, coefficients(WHOLE), rate_filter("centred", layout.interval_ns))
+    pipeline = Pipeline(profile, coefficients(WHOLE), "centred")
     outputs, now = [], 0
     for piece in wire(run, layout):
         sent, begin, i = piece.t_ns + piece.t_ns // 50_000 + 10**18, 0, 0

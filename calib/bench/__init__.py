@@ -2,7 +2,7 @@
 
 entries, journal                        events of a session, and their append-only file
 state, session                          what the journal determines, and the folder open for writing
-evidence, verify                        recompute the result, audit
+result, verify                          recompute the result, audit
 controller, queue_sink, recordings      worker thread: steps and their recordings
 completion                              decision, certificate and report
 screen, keys, block_letters             terminal of the operator

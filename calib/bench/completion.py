@@ -1,16 +1,14 @@
 """After the steps: result, the operator's decision, activation of the certificate, and report."""
 
 from calib.bench.entries import ResidualVelocity
-from calib.bench.evidence import Result, identify_session, residual_velocity
 from calib.bench.keys import Keyboard
 from calib.bench.queue_sink import QueueReader
+from calib.bench.result import Result, identify_session
 from calib.bench.screen import OperatorScreen
 from calib.bench.session import Session
 from calib.bench.state import REPORT, RESULT
 from calib.certificate import write
 from calib.lever_arms.gauge import convert
-from calib.procedure.plan import verification
-from calib.procedure.schema import VERIFICATION
 from calib.reports.identification import arms_text, report_html, verdict
 from imudrv.calibration import Calibration, read_calibration, write_calibration
 from imudrv.errors import InputError
@@ -32,7 +30,7 @@ def session_result(session: Session) -> Result:
 
 def decide_alone(result: Result) -> bool:
     """Return whether the verdicts on a result allow to accept it without an operator."""
-    return all(mark != "bad" for mark, _ in verdict(result.findings))
+    return all(mark != "bad" for mark, _ in verdict(result.identification))
 
 
 def ask_operator(unit: str, screen: OperatorScreen, keys: Keyboard, queue: QueueReader) -> bool:
@@ -70,8 +68,8 @@ def ask_operator(unit: str, screen: OperatorScreen, keys: Keyboard, queue: Queue
 
 def summary(result: Result) -> str:
     """Return the text on which the operator decides."""
-    verdicts = [f"{mark}: {text}" for mark, text in verdict(result.findings)]
-    return "\n".join([arms_text(result.findings.arms), *verdicts])
+    verdicts = [f"{mark}: {text}" for mark, text in verdict(result.identification)]
+    return "\n".join([arms_text(result.identification.arms), *verdicts])
 
 
 def activate(session: Session, certificate: Calibration) -> None:
@@ -93,16 +91,10 @@ def activate(session: Session, certificate: Calibration) -> None:
         )
 
 
-def verification_residual(session: Session, certificate: Calibration) -> ResidualVelocity:
-    """Return the residual velocity after the verification rotation."""
-    procedure = verification(session.procedure())
-    return residual_velocity(procedure, session.attempts()[VERIFICATION], certificate, session.site())
-
-
 def write_report(session: Session, result: Result, residual: ResidualVelocity | None) -> None:
     """Write the report, with the verification after the result, and record its hash."""
-    arms = result.findings.arms
-    html = report_html(result.findings, (arms, convert(arms, "x")))
+    arms = result.identification.arms
+    html = report_html(result.identification, (arms, convert(arms, "x")))
     text = "The verification was skipped."
     if residual is not None:
         text = f"One more rotation with the new certificate: {residual}."

@@ -4,12 +4,12 @@ The service reads the unit in the main thread, as in production. One of its sink
 which `SessionController` takes samples: it feeds the engine, journals its events, begins and ends recordings,
 shows the view and reads keys. Engine and session do not know each other.
 
-The worker may be late, by seconds on a loaded machine or a slow disk; the evidence is complete all the same:
+The worker may be late, by seconds on a loaded machine or a slow disk; nothing of a recording is lost then:
 
 - A recording begins at the sample at which the engine asked to place the unit, however late the worker
   handles that event: the service keeps the last minutes of wire data (`imudrv.sinks.history`).
 - A step is accepted, shown as good and journaled only after its recording has been closed, decoded and found
-  to contain every sample of the evidence. Otherwise the step is rejected with that reason and repeated.
+  to contain every sample of the attempt. Otherwise the step is rejected with that reason and repeated.
 - The worker never waits for the terminal: an `OperatorScreen` writes in a thread of its own.
 
 The stages of a session are the steps, the result, the decision and the verification. Each is journaled, so
@@ -19,6 +19,7 @@ that a resumed session continues after the last one.
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from math import isnan
 from typing import Final
 
 import numpy as np
@@ -29,21 +30,20 @@ from calib.bench.completion import (
     decide_alone,
     session_result,
     summary,
-    verification_residual,
     write_report,
 )
 from calib.bench.entries import Counted, Decision, ServiceMessage, SessionEnded, UnitDetected
-from calib.bench.evidence import Result
 from calib.bench.keys import Keyboard
 from calib.bench.queue_sink import QueueReader, QueueSink, ServiceEndedError
 from calib.bench.recordings import AttemptRecordings
+from calib.bench.result import Result, residual_velocity
 from calib.bench.resume import require_temperature
 from calib.bench.screen import OperatorScreen, with_port_state
 from calib.bench.session import Session
 from calib.bench.state import REPORT
+from calib.messages import english
 from calib.procedure.engine import Engine
 from calib.procedure.events import Aborted, Accepted, Conditions, Entered, Event, Finished, Phase, Rejected
-from calib.procedure.messages import english
 from calib.procedure.plan import steps_left, verification
 from calib.procedure.schema import VERIFICATION, Procedure
 from imudrv.errors import InputError
@@ -51,7 +51,7 @@ from imudrv.records import INCREMENTS, Records
 from imudrv.service.loop import Service
 from imudrv.sinks.base import Batch
 from imudrv.units import NS_PER_S
-from imudrv.wire.layout import Layout
+from imudrv.wire.layout import Layout, SequenceKind
 
 REDRAW_S: Final = 0.2
 """Interval at which the screen is redrawn and keys are read, s."""
@@ -135,8 +135,7 @@ class SessionController:
             if isinstance(last, Aborted):
                 return
             if last.reasons:
-                missing = "\n  ".join(map(english, last.reasons))
-                raise InputError(f"too few steps are accepted; resume and do the skipped ones:\n  {missing}")
+                raise InputError(f"no result: {'; '.join(map(english, last.reasons))}; resume the session")
             session.append(last)
         self._screen.print("Computing the lever arms from the recordings ...")
         result = session_result(session)
@@ -151,7 +150,7 @@ class SessionController:
             return
         residual = None
         if VERIFICATION in last.accepted:
-            residual = verification_residual(session, result.certificate)
+            residual = residual_velocity(session, result.certificate)
         if session.stage(SessionEnded) is None:
             write_report(session, result, residual)
             session.append(SessionEnded(residual))
@@ -175,7 +174,7 @@ class SessionController:
         return decision.accepted
 
     def _run_steps(self, procedure: Procedure) -> Finished | Aborted:
-        """Conduct the steps that are not accepted yet; on return all evidence is filed."""
+        """Conduct the steps that are not accepted yet; on return all recordings are filed."""
         session = self._session
         ids = {step.id for step in procedure.steps}
         accepted = {name: step for name, step in session.accepted.items() if name in ids}
@@ -211,26 +210,33 @@ class SessionController:
         return last
 
     def _feed(self, engine: Engine, batch: Batch) -> tuple[Event, ...]:
-        """Feed samples to the engine, and status and temperatures once a second or at a change of status."""
+        """Feed samples to the engine; faults and temperatures once a second, or when the faults change."""
+        if self._service.port_state.name == "wrong rate":
+            return ()  # their intervals are wrong; afterwards the engine finds the gap
         events: tuple[Event, ...] = ()
         if len(batch.pulses):
             newest = batch.pulses[-1]
             conditions = _conditions(newest, self._layout)
             since_ns = int(newest["elapsed_ns"]) - self._conditions_ns
-            if conditions.bits != self._conditions.bits or not 0 <= since_ns < NS_PER_S:
+            is_due = not self._is_unit_detected or not 0 <= since_ns < NS_PER_S
+            if is_due or conditions.faults != self._conditions.faults:
                 self._conditions, self._conditions_ns = conditions, int(newest["elapsed_ns"])
                 if not self._is_unit_detected:
                     self._is_unit_detected = True
-                    self._check_unit(int(newest["counter"]))
+                    self._check_unit(int(newest["counter"]) // self._layout.counter_step)
                 events = engine.update_status(conditions)
         return events + engine.feed(batch.increments)
 
     def _check_unit(self, counter: int) -> None:
-        """Check the temperature of the unit when its first data arrive, and note whether it has restarted."""
+        """Check the temperature of the unit when its first data arrive, and note whether it has restarted.
+
+        Samples of a unit without a counter are numbered from 0 by each process: that shows no restart.
+        """
         session, degc = self._session, dict(self._conditions.temperature_degc)
         require_temperature(session, degc)
         newest = max((entry.counter for entry in session.entries if isinstance(entry, Counted)), default=-1)
-        session.append(UnitDetected(counter, counter < newest, degc))
+        is_counted = self._layout.sequence.kind is SequenceKind.COUNTER
+        session.append(UnitDetected(counter, is_counted and counter < newest, degc))
 
     def _apply_events(self, engine: Engine, events: Sequence[Event]) -> Finished | Aborted | None:
         """Journal events, begin and end recordings; return the event that ends the steps."""
@@ -262,13 +268,10 @@ class SessionController:
 
 
 def _conditions(pulses: Records, layout: Layout) -> Conditions:
-    """Return status bits, faults and temperatures of a sample."""
-
-    def names(word: int) -> tuple[str, ...]:
-        return tuple(name for bit, name in layout.status_names if word >> bit & 1)
-
-    word = int(pulses["status"])
+    """Return faults and temperatures of a sample."""
+    bits = layout.active_bits(int(pulses["status"]))
     degc = zip(layout.temperature_names, pulses["temperature_degc"].tolist(), strict=False)
     return Conditions(
-        names(word), names(word & layout.status.fault), {name: t if t == t else None for name, t in degc}
+        tuple(name for mask, name in bits.items() if mask & layout.status.fault),
+        {name: None if isnan(t) else t for name, t in degc},
     )

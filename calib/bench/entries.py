@@ -12,6 +12,7 @@ from typing import Any, Final, Literal, Self, TypeAlias, get_args
 
 from pydantic import TypeAdapter, ValidationError
 
+from calib.messages import verbatim
 from calib.procedure.events import (
     Aborted,
     Accepted,
@@ -23,7 +24,6 @@ from calib.procedure.events import (
     Restarted,
     Skipped,
 )
-from calib.procedure.messages import verbatim
 from imudrv.errors import InputError
 from imudrv.units import MM
 

@@ -20,6 +20,7 @@ from typing import Any, Final, NamedTuple, TypeAlias
 
 from calib.bench.entries import Entry, LineDropped, Plan, from_json, to_json
 from imudrv.errors import InputError
+from imudrv.files.atomic import sync_folder
 
 _Line: TypeAlias = dict[str, Any]
 
@@ -157,6 +158,7 @@ def begin(path: Path, plan: Plan) -> None:
             file.write(_line(_stamped(plan), "")[0])
             file.flush()
             os.fsync(file.fileno())
+        sync_folder(path.parent)
     except OSError as error:
         raise InputError(f"{path}: cannot be created: {error.strerror or error}") from error
 

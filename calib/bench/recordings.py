@@ -6,8 +6,8 @@ from dataclasses import fields
 import numpy as np
 
 from calib.bench.entries import AcceptedStep
-from calib.bench.evidence import uncovered
 from calib.bench.queue_sink import QueueReader, ServiceEndedError
+from calib.bench.result import uncovered
 from calib.bench.session import Session
 from calib.bench.state import Attempt
 from calib.procedure.events import Accepted, NavigationLog

@@ -2,10 +2,12 @@
 
 import os
 import tempfile
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from signal import SIGHUP, SIGINT, SIGTERM
 from threading import Thread
 from typing import Final
 
@@ -20,12 +22,16 @@ from calib.bench.screen import OperatorScreen
 from calib.bench.session import Session
 from calib.bench.simulated_unit import SimulatedUnitProcess, is_rehearsal
 from calib.bench.state import JOURNAL, REPORT, WORKING_CERTIFICATE
+from calib.inputs import require_six_axes
 from calib.procedure.plan import load_file, predicted
 from calib.procedure.schema import Procedure
 from imudrv import profiles
+from imudrv.calibration import coefficients, read_calibration
 from imudrv.errors import InputError
 from imudrv.files import settings_file
+from imudrv.imu.compensation import require_sensors
 from imudrv.service.loop import Service
+from imudrv.service.runtime import SignalFlags
 from imudrv.service.settings import Settings
 from imudrv.sinks.history import History
 from imudrv.site import Site
@@ -65,7 +71,7 @@ class RunOptions:
         Use a simulated unit and technician, hands free.
     speed : str
         Speed of the rehearsal: a number, or ``max``.
-    redo : tuple of str
+    redo : sequence of str
         Steps of an existing session to do again.
     """
 
@@ -78,7 +84,7 @@ class RunOptions:
     hands_free: bool = False
     rehearse: bool = False
     speed: str = "1"
-    redo: tuple[str, ...] = ()
+    redo: Sequence[str] = ()
 
     @property
     def is_rehearsal(self) -> bool:
@@ -141,6 +147,7 @@ def conduct(session: Session, options: RunOptions, console: Console) -> int:
     plan = session.plan
     simulated = SimulatedUnitProcess(session.folder, options.speed) if options.is_rehearsal else None
     queue = QueueSink(QUEUE_LIMIT if simulated is not None and simulated.waits else None)
+    layout = profiles.load(plan.profile.name).layout()
     settings = Settings(
         port=options.port or plan.port,
         profile=plan.profile.name,
@@ -148,12 +155,14 @@ def conduct(session: Session, options: RunOptions, console: Console) -> int:
         unit=plan.unit,
         status=str(Path(tempfile.gettempdir()) / f"imu50-calib-{os.getpid()}.sock"),
     )
+    signals = SignalFlags()
     service = Service(
         settings,
         lambda text: queue.put_message(text.partition(" ")[2]),
         [queue],
         in_real_time=simulated is None,
-        history=History(),
+        history=History(counter_step=layout.counter_step),
+        signals=signals,
     )
 
     def begin(steps: Procedure) -> None:
@@ -162,7 +171,7 @@ def conduct(session: Session, options: RunOptions, console: Console) -> int:
 
     controller = SessionController(
         session,
-        profiles.load(plan.profile.name).layout(),
+        layout,
         service,
         queue,
         OperatorScreen(console),
@@ -171,17 +180,20 @@ def conduct(session: Session, options: RunOptions, console: Console) -> int:
         begin=begin,
     )
     worker = Thread(target=controller.run, name="controller")
-    worker.start()
-    try:
-        service.run()
-    finally:
-        queue.close()
-        worker.join()
-        if simulated is not None:
-            simulated.end()
-        if not controller.outcome:
-            console.print(f"accepted steps: {', '.join(session.accepted) or 'none'}", markup=False)
-            console.print(f"resume with: calib run --session {session.folder}", markup=False, soft_wrap=True)
+    # From here on: an interrupt while compiled code is loaded could be lost or leave a lock behind.
+    with signals.caught(SIGINT, SIGTERM, SIGHUP):
+        worker.start()
+        try:
+            service.run()
+        finally:
+            queue.close()
+            worker.join()
+            if simulated is not None:
+                simulated.end()
+            if not controller.outcome:
+                console.print(f"accepted steps: {', '.join(session.accepted) or 'none'}", markup=False)
+                resume_command = f"resume with: calib run --session {session.folder}"
+                console.print(resume_command, markup=False, soft_wrap=True)
     if controller.error is not None:
         raise controller.error
     if not controller.outcome:
@@ -209,10 +221,16 @@ def _create(options: RunOptions, console: Console) -> Session:
     procedure = load_file(name)
     port, calibration, site, profile = options.port, options.calibration, options.site, options.profile
     if options.is_rehearsal:
-        port, calibration, site = SimulatedUnitProcess(folder, options.speed).make(procedure.model)
         profile = profile or REHEARSAL_PROFILE
-    if port is None or profile is None or calibration is None or site is None:
-        raise InputError("a new session: expected --port, --profile, --calibration and --site")
+    incomplete = InputError("a new session: expected --port, --profile, --calibration and --site")
+    if profile is None:
+        raise incomplete
+    layout = require_six_axes(profiles.load(profile).layout())
+    if options.is_rehearsal:
+        port, calibration, site = SimulatedUnitProcess(folder, options.speed).make(layout)
+    if port is None or calibration is None or site is None:
+        raise incomplete
+    require_sensors(coefficients(read_calibration(calibration)), layout)
     place = settings_file.read_file(site, Site)
     worst_mm = float(predicted(procedure.model, place.model).differences_sigma.max()) / MM
     expected = f"session {folder}: expected accuracy of the differences: {worst_mm:.3f} mm (1 sigma)"

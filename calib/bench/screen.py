@@ -16,8 +16,8 @@ from rich.table import Table
 from rich.text import Text
 
 from calib.bench import block_letters
+from calib.messages import english, message, verbatim
 from calib.procedure.events import Phase, View
-from calib.procedure.messages import english, message, verbatim
 from imudrv.diagnosis import LineState
 
 NO_DATA: Final = message("no_data")
@@ -26,6 +26,10 @@ NO_DATA: Final = message("no_data")
 
 NO_FRAMES: Final = message("no_frames")
 """Headline while the data contain no frame of the profile."""
+
+
+WRONG_RATE: Final = message("wrong_rate")
+"""Headline while the unit sends at another rate than its profile's."""
 
 
 _OTHER_ROWS: Final = 8
@@ -59,7 +63,7 @@ _STYLES: Final = {
 
 
 def with_port_state(view: View, state: LineState) -> View:
-    """Add a fault of the line to a view; without samples it becomes the headline.
+    """Add a fault of the line to a view, and make it the headline.
 
     Parameters
     ----------
@@ -75,7 +79,7 @@ def with_port_state(view: View, state: LineState) -> View:
     """
     if not state.trouble:
         return view
-    headlines = {"streaming": view.headline, "unreadable": NO_FRAMES}
+    headlines = {"unreadable": NO_FRAMES, "wrong rate": WRONG_RATE}
     headline = headlines.get(state.name, NO_DATA)
     return replace(view, headline=headline, reasons=(verbatim(str(state)), *view.reasons))
 
@@ -235,7 +239,11 @@ def _time(seconds: float | None) -> str:
 
 def _banner(view: View, width: int, height: int, ascii_only: bool) -> RenderableType:
     refused = view.reasons and view.phase in (Phase.PREFLIGHT, Phase.PLACE, Phase.VERDICT)
-    style = "white on red" if refused or view.headline in (NO_DATA, NO_FRAMES) else _STYLES[view.phase]
+    style = (
+        "white on red"
+        if refused or view.headline in (NO_DATA, NO_FRAMES, WRONG_RATE)
+        else _STYLES[view.phase]
+    )
     headline, inside = english(view.headline), width - 2
     scale, lines = block_letters.fitted(headline, inside, height)
     if ascii_only and scale < 2:
@@ -280,7 +288,7 @@ def _figures(view: View, width: int, ascii_only: bool) -> RenderableType:
         "green" if view.stillness > 0.8 else "red",
         "" if view.stillness > 0.8 else "moving",
     )
-    add("progress", view.progress, "yellow", _percent(view.progress))
+    add("progress", view.progress, "yellow", "" if view.progress is None else f"{view.progress:.0%}")
     sigmas = [
         f"{name} {sigma:.4f} deg"
         for name, sigma in (("level", view.level_sigma_deg), ("heading", view.heading_sigma_deg))
@@ -288,10 +296,6 @@ def _figures(view: View, width: int, ascii_only: bool) -> RenderableType:
     ]
     table.add_row("1 sigma", ", ".join(sigmas), "")
     return table
-
-
-def _percent(part: float | None) -> str:
-    return "" if part is None else f"{part:.0%}"
 
 
 def _bar(part: float | None, width: int, style: str, ascii_only: bool) -> Text:

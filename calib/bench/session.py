@@ -1,4 +1,4 @@
-"""Folder of a session: plan, journal and evidence; safe against a kill or power cut.
+"""Folder of a session: plan, journal and recordings; safe against a kill or power cut.
 
 ====================  ===================================================================================
 ``journal.jsonl``     see `calib.bench.journal`; its first line is the plan
@@ -9,7 +9,7 @@
 ====================  ===================================================================================
 
 The SHA-256 of each file is written to the journal once the file is closed. A step is accepted only when its
-files are recorded there and its recording has been decoded and found to cover the evidence of the step. The
+files are recorded there and its recording has been decoded and found to cover the attempt. The
 result can therefore always be computed again from the files.
 """
 
@@ -37,6 +37,7 @@ from calib.procedure.schema import VERIFICATION
 from imudrv import profiles
 from imudrv.calibration import Calibration, read_calibration, read_calibration_file, write_calibration
 from imudrv.errors import InputError
+from imudrv.files.atomic import sync_folder
 
 
 class Session(SessionState):
@@ -179,7 +180,7 @@ class Session(SessionState):
                 os.fsync(file.fileno())
                 digest = hashlib.file_digest(file, "sha256").hexdigest()
                 size = file.tell()
-            _sync_folder(self.folder)
+            sync_folder(self.folder)
         except OSError as error:
             raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
         self.append(FileRecorded(name, size, digest, left))
@@ -238,11 +239,3 @@ def _locked(folder: Path) -> int:
         os.close(lock)
         raise InputError(f"{folder}: another process has this session open; end it first") from None
     return lock
-
-
-def _sync_folder(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

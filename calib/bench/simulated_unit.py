@@ -9,10 +9,13 @@ from typing import Final
 
 from calib.bench.technician import BENCH, technician_scenario, true_calibration
 from calib.procedure.schema import Procedure
+from imudrv import profiles
 from imudrv.calibration import write_calibration
 from imudrv.errors import InputError
 from imudrv.files import settings_file
-from imudrv.sim.live import speed_of
+from imudrv.sim.scenario import nominal
+from imudrv.url import speed_of
+from imudrv.wire.layout import Layout
 
 SEED: Final = 1
 """Random seed of the rehearsal's unit and technician."""
@@ -60,13 +63,13 @@ class SimulatedUnitProcess:
         self.waits = speed_of(speed) is None
         self._unit: subprocess.Popen[str] | None = None
 
-    def make(self, procedure: Procedure) -> tuple[str, Path, Path]:
+    def make(self, layout: Layout) -> tuple[str, Path, Path]:
         """Write the unit's certificate and site.
 
         Parameters
         ----------
-        procedure : Procedure
-            Procedure of the session.
+        layout : Layout
+            Layout of the profile.
 
         Returns
         -------
@@ -78,7 +81,7 @@ class SimulatedUnitProcess:
             Site of the bench.
         """
         self._folder.mkdir(parents=True, exist_ok=True)
-        unit = true_calibration(SEED)
+        unit = true_calibration(SEED, nominal(layout))
         certificate, site = self._folder / "unit.yaml", self._folder / "site.yaml"
         write_calibration(certificate, unit.model_copy(update={"size_effect": None}))
         settings_file.write(site, BENCH)
@@ -101,7 +104,8 @@ class SimulatedUnitProcess:
         """
         self.end()
         scenario = self._folder / "scenario.yaml"
-        settings_file.write(scenario, technician_scenario(procedure, seed=SEED))
+        sends = nominal(profiles.load(profile).layout())
+        settings_file.write(scenario, technician_scenario(procedure, seed=SEED, unit=sends))
         command = ["sim", str(scenario), "--profile", profile, "--port", "pty", "--link", str(self._link)]
         self._unit = unit = subprocess.Popen(
             [sys.executable, "-c", _UNIT, str(os.getpid()), *command, "--speed", self._speed],

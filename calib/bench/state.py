@@ -54,9 +54,9 @@ class Attempt(NamedTuple):
     recording : Path
         Its recording.
     first_counter, last_counter : int
-        First and last sample of the evidence, in the service's count.
+        First and last sample of the attempt, in the service's count.
     samples : int or None
-        Number of samples of the evidence; None if unknown, as in sessions of an older version.
+        Number of samples of the attempt; None if unknown, as in sessions of an older version.
     """
 
     step: Step

@@ -15,12 +15,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation as Attitude
 
 from calib.axes import side
+from calib.certificate import sensing_points
 from calib.procedure.plan import TURN_S
 from calib.procedure.preflight import PREFLIGHT_S
 from calib.procedure.prompts import READY_S
 from calib.procedure.schema import Procedure, Step
 from imudrv.arrays import Array
-from imudrv.calibration import Calibration, SensingPoints, SizeEffect
+from imudrv.calibration import Calibration, SizeEffect
 from imudrv.errors import InputError
 from imudrv.nav.attitude import rotation
 from imudrv.sim.path import start_attitude
@@ -83,8 +84,8 @@ def technician_scenario(
     mistakes: Sequence[Mistake] = (),
     *,
     seed: int = 1,
-    site: Site = BENCH,
     calibration: Calibration | None = None,
+    unit: Calibration = NOMINAL,
 ) -> Scenario:
     """Return the scenario of a procedure carried out by hand.
 
@@ -96,10 +97,10 @@ def technician_scenario(
         At most one per step; the step is repeated after it.
     seed : int
         Random seed of the unit's errors, its lever arms, and the technician's hands.
-    site : Site
-        Site of the bench.
     calibration : Calibration, optional
         Certificate of the unit; its `size_effect` is the truth. Default: `true_calibration` of the seed.
+    unit : Calibration
+        The unit whose lever arms are drawn by default.
 
     Returns
     -------
@@ -119,7 +120,7 @@ def technician_scenario(
             f"got {', '.join(m.step_id for m in mistakes)}"
         )
     rng = np.random.default_rng(seed)
-    truth = _draw_lever_arms(rng) if calibration is None else calibration
+    truth = _draw_lever_arms(rng, unit) if calibration is None else calibration
     hands = _MotionScript(procedure, rng)
     for step in procedure.steps:
         hands.do(step, kinds.get(step.id))
@@ -128,7 +129,7 @@ def technician_scenario(
         format="imu50-scenario",
         version=1,
         seed=seed,
-        site=site,
+        site=BENCH,
         start=hands.start,
         motion=tuple(hands.motion),
         unit=Unit(
@@ -147,18 +148,17 @@ def technician_scenario(
     )
 
 
-def true_calibration(seed: int) -> Calibration:
-    """Return the nominal unit with random lever arms, as `technician_scenario` simulates it."""
-    return _draw_lever_arms(np.random.default_rng(seed))
+def true_calibration(seed: int, unit: Calibration = NOMINAL) -> Calibration:
+    """Return a unit with random lever arms, as `technician_scenario` simulates it."""
+    return _draw_lever_arms(np.random.default_rng(seed), unit)
 
 
-def _draw_lever_arms(rng: np.random.Generator) -> Calibration:
-    """Draw the nominal unit's lever arms, in gauge centroid."""
+def _draw_lever_arms(rng: np.random.Generator, unit: Calibration) -> Calibration:
+    """Draw the lever arms of a unit, in gauge centroid."""
     r_mm = np.round(rng.normal(0.0, ARM_MM, (3, 3)), 3)
     r_mm[2] = -r_mm[0] - r_mm[1]
-    x, y, z = (tuple(row) for row in np.round(r_mm, 3).tolist())
-    size_effect = SizeEffect(r_mm=SensingPoints(x=x, y=y, z=z), gauge="centroid")
-    return NOMINAL.model_copy(update={"serial_number": "rehearsal", "size_effect": size_effect})
+    size_effect = SizeEffect(r_mm=sensing_points(np.round(r_mm, 3)), gauge="centroid")
+    return unit.model_copy(update={"serial_number": "rehearsal", "size_effect": size_effect})
 
 
 class _MotionScript:

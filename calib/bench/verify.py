@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from calib.bench import journal
-from calib.bench.evidence import identify_session, require_covered
+from calib.bench.result import decode_covered, identify_session
 from calib.bench.state import JOURNAL, LOCK, RESULT, SessionState, require_session
 from calib.certificate import PROVENANCE_IDENTIFIED
 from imudrv.calibration import Calibration, read_calibration
@@ -90,11 +90,11 @@ def faulty_files(session: SessionState) -> list[str]:
 
 
 def uncovered_steps(session: SessionState) -> list[str]:
-    """Return the accepted steps whose recordings lack a part of the evidence, one line each."""
+    """Return the accepted steps whose recordings lack samples, one line each."""
     faults = []
     for attempt in session.attempts().values():
         try:
-            require_covered(attempt)
+            decode_covered(attempt)
         except InputError as error:
             faults.append(str(error))
     return faults

@@ -2,7 +2,7 @@
 
 import argparse
 from pathlib import Path
-from typing import Any, Final, Literal, TypeAlias
+from typing import Any, Final
 
 from calib.lever_arms.gauge import GAUGES, LeverArms
 from imudrv.calibration import Calibration
@@ -12,10 +12,6 @@ from imudrv.units import MM
 
 PROGRAMS: Final = ("kalibr", "psins")
 """Programs that lever arms are exchanged with."""
-
-
-KnownPoint: TypeAlias = tuple[Literal["x", "y", "z"], list[float]]
-"""An accelerometer and its sensing point in body axes, m."""
 
 
 def add_gauge(parser: argparse.ArgumentParser, option: str, **more: Any) -> None:
@@ -28,7 +24,7 @@ def add_gauge(parser: argparse.ArgumentParser, option: str, **more: Any) -> None
 
 def add_channel(parser: argparse.ArgumentParser) -> None:
     """Add ``--channel``."""
-    parser.add_argument("--channel", metavar="NAME", help="CAN channel of candump logs, such as can0")
+    parser.add_argument("--channel", metavar="NAME", help="channel of CAN logs, such as can0")
 
 
 def add_certificate_output(parser: argparse.ArgumentParser) -> None:
@@ -37,8 +33,8 @@ def add_certificate_output(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="NEW.yaml", help=text)
 
 
-def known_point(text: str | None) -> KnownPoint | None:
-    """Parse a sensing point such as ``y=12.5,-3,40``, mm."""
+def known_point(text: str | None) -> tuple[str, list[float]] | None:
+    """Parse an accelerometer and its sensing point, mm, such as ``y=12.5,-3,40``; return it in m."""
     if text is None:
         return None
     accelerometer, _, rest = text.partition("=")
@@ -46,12 +42,11 @@ def known_point(text: str | None) -> KnownPoint | None:
         point = [float(value) * MM for value in rest.split(",")]
     except ValueError:
         point = []
-    for name in ("x", "y", "z"):
-        if accelerometer == name and len(point) == 3:
-            return name, point
-    raise InputError(
-        f"--at: expected an accelerometer and three numbers in mm, such as y=12.5,-3,40, got {text!r}"
-    )
+    if accelerometer not in ("x", "y", "z") or len(point) != 3:
+        raise InputError(
+            f"--at: expected an accelerometer and three numbers in mm, such as y=12.5,-3,40, got {text!r}"
+        )
+    return accelerometer, point
 
 
 def check_output(path: Path, *inputs: str | Path | None) -> None:

@@ -30,7 +30,8 @@ def run(arguments: argparse.Namespace) -> None:
     arms = convert(before, arguments.gauge, point)
     how: dict[str, Any] = {"from": before.gauge, "to": arms.gauge, "file_sha256": file.sha256}
     if point is not None:
-        how["stated_mm"] = {point[0]: [value / MM for value in point[1]]}
+        accelerometer, r_b = point
+        how["stated_mm"] = {accelerometer: [value / MM for value in r_b]}
     write(arguments.output, with_lever_arms(file.model, arms, PROVENANCE_CONVERTED, how))
     print(arms_text(arms), end="")
     print(written_text(arguments.output, file.model, arms))

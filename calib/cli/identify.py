@@ -6,7 +6,6 @@ from typing import Final, get_args
 
 from calib.certificate import certificate, check_target, write
 from calib.cli.arguments import (
-    KnownPoint,
     add_certificate_output,
     add_channel,
     add_gauge,
@@ -29,13 +28,11 @@ EXAMPLE: Final = (
     "z-up.raw x-up.raw y-up.raw --profile imu50-rs422 --calibration unit.yaml --site site.yaml -o new.yaml"
 )
 
-_EXTRAS: Final[tuple[Extra, ...]] = get_args(Extra)
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     add = parser.add_argument
-    text = "wire bytes, candump logs, or recordings (.mcap), which contain their profile"
+    text = "wire bytes, CAN logs, or recordings (.mcap), which contain their profile"
     add("captures", type=Path, nargs="+", metavar="CAPTURE", help=text)
     add_profile(parser)
     add_channel(parser)
@@ -51,18 +48,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "fixed: the origin of the body frame does not move, as on a turntable; determines all nine components"
     )
     add("--pivot", choices=("free", "fixed"), default="free", help=text)
-    text = f"estimate more parameters: {','.join(_EXTRAS)}"
-    add("--estimate", type=_extra_parameters, default=(), metavar="NAMES", help=text)
+    text = "estimate more parameters"
+    add("--estimate", choices=get_args(Extra), help=text)
     add_certificate_output(parser)
     add("--json", type=Path, metavar="R.json", help="the whole result as JSON")
     add("--report", type=Path, metavar="R.html", help="report with figures, one file")
-
-
-def _extra_parameters(text: str) -> tuple[Extra, ...]:
-    names = tuple(text.split(","))
-    if unknown := [name for name in names if name not in _EXTRAS]:
-        raise argparse.ArgumentTypeError(f"expected {' or '.join(_EXTRAS)}, got {unknown[0]!r}")
-    return tuple(name for name in _EXTRAS if name in names)
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -73,7 +63,12 @@ def run(arguments: argparse.Namespace) -> None:
         check_output(output, *inputs)
     prior = prior_calibration(arguments.captures, arguments.calibration, arguments.unit)
     check_target(arguments.output, prior.calibration)
-    nine = arguments.gauge == "given" and point is None
+    options = EstimationOptions(
+        arguments.method,
+        arguments.pivot,
+        nine=arguments.gauge == "given" and point is None,
+        extra=(arguments.estimate,) if arguments.estimate else (),
+    )
     size = sum(path.stat().st_size for path in arguments.captures if path.exists())
     with progress("identify", 2 * size) as advance:  # each capture is read twice
         result = identify(
@@ -81,7 +76,7 @@ def run(arguments: argparse.Namespace) -> None:
             site=arguments.site,
             calibration=prior,
             profile=arguments.profile,
-            options=EstimationOptions(arguments.method, arguments.pivot, nine, tuple(arguments.estimate)),
+            options=options,
             channel=arguments.channel,
             advance=advance,
         )
@@ -103,7 +98,7 @@ def run(arguments: argparse.Namespace) -> None:
         print(*written, sep="\n")
 
 
-def _in_gauge(arms: LeverArms, gauge: Gauge | None, point: KnownPoint | None) -> LeverArms:
+def _in_gauge(arms: LeverArms, gauge: Gauge | None, point: tuple[str, list[float]] | None) -> LeverArms:
     """Return the arms in the requested gauge, by default that of the estimate."""
     if point is None and gauge in (None, arms.gauge):
         return arms

@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--site", type=Path, metavar="S.yaml", help="site of the bench: latitude, longitude, height")
     add("--procedure", metavar="P", help=f"{', '.join(plan.shipped())}, or a procedure file")
     text = "folder for journal and recordings; an existing session is resumed"
-    add("--session", type=Path, metavar="DIR", help=text)
+    add("--session", dest="folder", type=Path, default=new_folder(), metavar="DIR", help=text)
     text = "repeat this step of an existing session; may be given several times"
     add("--redo", action="append", default=[], metavar="STEP", help=text)
     add("--hands-free", action="store_true", help="continue by the sensors alone, without keys")
@@ -36,16 +36,4 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run or resume a session at the bench."""
-    options = RunOptions(
-        folder=arguments.session or new_folder(),
-        port=arguments.port,
-        profile=arguments.profile,
-        calibration=arguments.calibration,
-        site=arguments.site,
-        procedure=arguments.procedure,
-        hands_free=arguments.hands_free,
-        rehearse=arguments.rehearse,
-        speed=arguments.speed,
-        redo=tuple(arguments.redo),
-    )
-    return run_session(options, Console())
+    return run_session(RunOptions(**vars(arguments)), Console())

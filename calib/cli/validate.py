@@ -16,7 +16,7 @@ from calib.reports.text import print_document
 from calib.reports.validation import document
 from calib.validation.simulate import TRIALS, campaign, dither_trials, skew_trials
 from calib.validation.trial import RATE_FILTER, Trial
-from calib.validation.verdict import TrialMetrics, evaluate
+from calib.validation.verdict import Validation, evaluate
 from imudrv.calibration import Calibration, read_calibration
 from imudrv.cli.arguments import add_profile
 from imudrv.errors import InputError
@@ -34,7 +34,7 @@ NOT_GOOD: Final = 3
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     add = parser.add_argument
-    text = "rest, motion, rest: wire bytes, candump logs, or recordings (.mcap)"
+    text = "rest, motion, rest: wire bytes, CAN logs, or recordings (.mcap)"
     add("recordings", type=Path, nargs="*", metavar="RECORDING", help=text)
     text = "simulate units, with lever arms from a simulated procedure"
     add("--simulate", choices=(*TRIALS, "all"), help=text)
@@ -60,19 +60,18 @@ def run(arguments: argparse.Namespace) -> int:
         inputs = (*arguments.recordings, arguments.profile, arguments.calibration, arguments.site)
         check_output(arguments.report, *inputs)
     if arguments.simulate is not None:
-        trials = [(trial, evaluate(trial)) for trial in _simulated(arguments)]
-        shown = sum(trial.name.endswith("unit 1") for trial, _ in trials)
-        report = document("a simulated unit", trials, shown)
-        required = [metrics for trial, metrics in trials if "unit" in trial.name]
+        validations = [evaluate(trial) for trial in _simulated(arguments)]
+        drawn = sum(one.trial.name.endswith("unit 1") for one in validations)
+        report = document("a simulated unit", validations, drawn)
+        required = [one for one in validations if "unit" in one.trial.name]
     else:
-        calibration, trials = _navigated(arguments)
-        report = document(f"unit {calibration.serial_number}", trials, len(trials))
-        required = [metrics for _, metrics in trials]
+        calibration, required = _navigated(arguments)
+        report = document(f"unit {calibration.serial_number}", required, len(required))
     if arguments.report is not None:
         with atomic_write(arguments.report) as file:
             file.write(as_html(report).encode())
     print_document(report)
-    return OK if all(metrics.good for metrics in required) else NOT_GOOD
+    return OK if all(one.good for one in required) else NOT_GOOD
 
 
 def _simulated(arguments: argparse.Namespace) -> Iterator[Trial]:
@@ -88,7 +87,7 @@ def _simulated(arguments: argparse.Namespace) -> Iterator[Trial]:
             yield from dither_trials(1)
 
 
-def _navigated(arguments: argparse.Namespace) -> tuple[Calibration, list[tuple[Trial, TrialMetrics]]]:
+def _navigated(arguments: argparse.Namespace) -> tuple[Calibration, list[Validation]]:
     if arguments.calibration is None or arguments.site is None:
         raise InputError("validate: expected --calibration and --site with recordings")
     calibration = read_calibration(arguments.calibration)
@@ -107,5 +106,5 @@ def _navigated(arguments: argparse.Namespace) -> tuple[Calibration, list[tuple[T
                 channel=arguments.channel,
                 advance=advance,
             )
-        found.append((validation.trial, validation.metrics))
+        found.append(validation)
     return calibration, found

@@ -1,10 +1,12 @@
 """Limits of a rotation, and the reasons for rejection."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from math import hypot, inf
 from typing import Final, NamedTuple
 
 from calib.detection.segments import Rest, Rotation
+from calib.messages import Message, message
 from imudrv.records import Flag
 from imudrv.units import STANDARD_GRAVITY, UG, URAD
 
@@ -51,7 +53,7 @@ class RejectedRotation(NamedTuple):
     """A motion that is outside the limits, and the reasons."""
 
     rotation: Rotation
-    reasons: tuple[str, ...]
+    reasons: tuple[Message, ...]
 
 
 def assess(
@@ -66,7 +68,7 @@ def assess(
 
 def rejection_reasons(
     rotation: Rotation, limits: RotationLimits, expected: str | None = None
-) -> tuple[str, ...]:
+) -> tuple[Message, ...]:
     """Return why a motion is not a rotation of the procedure.
 
     Parameters
@@ -80,41 +82,51 @@ def rejection_reasons(
 
     Returns
     -------
-    tuple of str
+    tuple of Message
         Reasons, each with value and limit; empty: the rotation is accepted.
     """
-    r, reasons = rotation, []
-    if expected is not None and r.about != expected:
-        reasons.append(f"about {r.about}, expected {expected}")
-    if abs(abs(r.angle_deg) - limits.angle_deg) > limits.angle_tolerance_deg:
-        reasons.append(
-            f"turned {abs(r.angle_deg):.1f} deg, want {limits.angle_deg:g} +- {limits.angle_tolerance_deg:g}"
-        )
-    if r.axis_tilt_deg > limits.axis_tilt_deg:
-        reasons.append(
-            f"axis {r.axis_tilt_deg:.1f} deg off the vertical, want at most {limits.axis_tilt_deg:g}"
-        )
-    if r.peak_deg_per_s < limits.least_peak_deg_per_s:
-        error = ""
-        if r.peak_deg_per_s >= LEAST_EXTRAPOLATED_DEG_PER_S:
-            error = f", expect {expected_error_mm(r.peak_deg_per_s):.1f} mm"
-        reasons.append(
-            f"peak {r.peak_deg_per_s:.0f} deg/s: slower than {limits.least_peak_deg_per_s:g}{error}"
-        )
-    if r.missing > limits.missing:
-        reasons.append(f"{r.missing} samples missing during the rotation, want at most {limits.missing}")
-    for flag, what in ((Flag.SATURATED, "an axis saturated"), (Flag.FAULT, "the unit reported a fault")):
-        if r.flags & flag:
-            reasons.append(f"{what} during the rotation")
-    for rest, side, least in (
-        (r.before, "before", limits.rest_before_s),
-        (r.after, "after", limits.rest_after_s),
-    ):
-        if rest is None:
-            reasons.append(f"no rest {side} it, want {least:g} s")
-        elif rest.duration_s < least:
-            reasons.append(f"rest {side} {rest.duration_s:.1f} s, want {least:g}")
-    return tuple(reasons)
+    r, angle_deg, vertical = rotation, abs(rotation.angle_deg), expected or rotation.about
+    checks = (
+        (r.about != vertical, message("wrong_vertical", about=r.about, expected=vertical)),
+        (
+            abs(angle_deg - limits.angle_deg) > limits.angle_tolerance_deg,
+            message(
+                "wrong_angle",
+                angle_deg=angle_deg,
+                expected_deg=limits.angle_deg,
+                tolerance_deg=limits.angle_tolerance_deg,
+            ),
+        ),
+        (
+            r.axis_tilt_deg > limits.axis_tilt_deg,
+            message("axis_tilted", tilt_deg=r.axis_tilt_deg, limit_deg=limits.axis_tilt_deg),
+        ),
+        (r.peak_deg_per_s < limits.least_peak_deg_per_s, _too_slow(r, limits)),
+        (r.missing > limits.missing, message("samples_lost", missing=r.missing, limit=limits.missing)),
+        (r.flags & Flag.SATURATED, message("saturated")),
+        (r.flags & Flag.FAULT, message("fault_during_rotation")),
+    )
+    return (*(reason for failed, reason in checks if failed), *_rest_reasons(r, limits))
+
+
+def _too_slow(rotation: Rotation, limits: RotationLimits) -> Message:
+    peak, limit = rotation.peak_deg_per_s, limits.least_peak_deg_per_s
+    if peak < LEAST_EXTRAPOLATED_DEG_PER_S:
+        return message("too_slow", peak_deg_per_s=peak, limit_deg_per_s=limit)
+    error_mm = expected_error_mm(peak)
+    return message("too_slow_with_error", peak_deg_per_s=peak, limit_deg_per_s=limit, error_mm=error_mm)
+
+
+def _rest_reasons(rotation: Rotation, limits: RotationLimits) -> Iterator[Message]:
+    before, after = rotation.before, rotation.after
+    if before is None:
+        yield message("no_rest_before", limit_s=limits.rest_before_s)
+    elif before.duration_s < limits.rest_before_s:
+        yield message("short_rest_before", rest_s=before.duration_s, limit_s=limits.rest_before_s)
+    if after is None:
+        yield message("no_rest_after", limit_s=limits.rest_after_s)
+    elif after.duration_s < limits.rest_after_s:
+        yield message("short_rest_after", rest_s=after.duration_s, limit_s=limits.rest_after_s)
 
 
 def expected_error_mm(peak_deg_per_s: float) -> float:
@@ -122,6 +134,11 @@ def expected_error_mm(peak_deg_per_s: float) -> float:
 
     A minimum-jerk half turn takes `T = 180 * 1.875 / peak`; the velocity changes by 8.8 / T m/s per metre of
     lever arm, and by `T hypot(b, g m)` m/s from b = 50 ug of bias and m = 30 urad of gyro misalignment.
+
+    Examples
+    --------
+    >>> [round(expected_error_mm(peak), 2) for peak in (70.0, 140.0)]  # half the time: a quarter
+    [1.51, 0.38]
     """
     if peak_deg_per_s <= 0.0:
         return inf

@@ -1,16 +1,23 @@
 """Blocks of 20 ms, by the counter."""
 
-from typing import Final, NamedTuple
+import weakref
+from tempfile import SpooledTemporaryFile, gettempdir
+from typing import Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from imudrv.errors import InputError
+from imudrv.kernels import kernel
 from imudrv.records import Records
 from imudrv.units import NS
 from imudrv.vectors import Vector
 
 BLOCK_NS: Final = 20_000_000
 """Length of a block, ns."""
+
+
+_IN_MEMORY_BYTES: Final = 32 << 20
 
 
 BLOCK: Final = np.dtype(
@@ -117,11 +124,109 @@ class BlockSplitter:
         ]
 
 
-def join_blocks(block: Records, more: Records) -> None:
-    """Add to a block, in place, its samples of a later piece."""
-    for whole, inside in (("dtheta_b", "angle"), ("dv_b", "velocity")):
-        block[inside] += more[inside] + more["samples"] * block[whole]
-        block[whole] += more[whole]
-    for name in ("samples", "interval_ns"):
-        block[name] += more[name]
-    block["flags"] |= more["flags"]
+class BlockSums:
+    """Sums over the blocks of a capture; their bits do not depend on how the samples are divided.
+
+    Parameters
+    ----------
+    first : int
+        Counter of the first sample.
+    size : int
+        Samples per block.
+    """
+
+    def __init__(self, first: int, size: int) -> None:
+        self._first, self._size = first, size
+        self._open = np.zeros(1, BLOCK)
+
+    @property
+    def incomplete(self) -> int | None:
+        """Index of the block that has begun and is not complete, if there is one."""
+        return int(self._open["index"][0]) if self._open["samples"][0] else None
+
+    def feed(self, increments: Records) -> Records:
+        """Process samples and return the completed blocks.
+
+        Parameters
+        ----------
+        increments : ndarray of INCREMENTS
+            In order.
+
+        Returns
+        -------
+        ndarray of BLOCK
+        """
+        blocks = np.empty(len(increments) + 1, BLOCK)
+        return blocks[: _add(increments, self._first, self._size, self._open, blocks)]
+
+
+@kernel
+def _add(increments: Records, first: int, size: int, open_block: Records, blocks: Records) -> int:
+    """Add samples to the open block; return the number of blocks that became complete."""
+    block, done = open_block[0], 0
+    for i in range(len(increments)):
+        sample = increments[i]
+        index = (sample["counter"] - first) // size
+        if block["samples"] and block["index"] != index:
+            blocks[done] = block
+            block["samples"] = 0
+            done += 1
+        if block["samples"] == 0:
+            block["index"], block["interval_ns"], block["flags"] = index, 0, 0
+            for axis in range(3):
+                block["dtheta_b"][axis] = block["dv_b"][axis] = 0.0
+                block["angle"][axis] = block["velocity"][axis] = 0.0
+        block["samples"] += 1
+        block["interval_ns"] += sample["interval_ns"]
+        block["flags"] |= sample["flags"]
+        for axis in range(3):
+            block["dtheta_b"][axis] += sample["dtheta_b"][axis]
+            block["dv_b"][axis] += sample["dv_b"][axis]
+            block["angle"][axis] += block["dtheta_b"][axis]
+            block["velocity"][axis] += block["dv_b"][axis]
+        if sample["counter"] - first == (index + 1) * size - 1:
+            blocks[done] = block
+            block["samples"] = 0
+            done += 1
+    return done
+
+
+class BlockStore:
+    """Blocks of a capture in order; those of more than an hour are in a temporary file."""
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._file = SpooledTemporaryFile(_IN_MEMORY_BYTES)  # noqa: SIM115
+        weakref.finalize(self, self._file.close)
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __deepcopy__(self, _: dict[int, object]) -> Self:
+        copy = type(self)()  # with a file of its own
+        copy.append(self.rows(0, len(self)))
+        return copy
+
+    def append(self, blocks: Records) -> None:
+        """Append blocks.
+
+        Raises
+        ------
+        InputError
+            The disk is full.
+        """
+        try:
+            self._file.seek(0, 2)
+            self._file.write(blocks.tobytes())
+        except OSError as error:
+            size_mb = (self._count + len(blocks)) * BLOCK.itemsize / 1e6
+            raise InputError(
+                f"{gettempdir()}: expected room for {size_mb:.0f} MB of a long capture, cannot write them: "
+                f"{error.strerror}; set TMPDIR to another folder"
+            ) from error
+        self._count += len(blocks)
+
+    def rows(self, begin: int, stop: int) -> Records:
+        """Return the blocks from `begin` to `stop`."""
+        self._file.seek(begin * BLOCK.itemsize)
+        return np.frombuffer(self._file.read((stop - begin) * BLOCK.itemsize), BLOCK)

@@ -1,19 +1,21 @@
 """Detection of rests and rotations in increments.
 
-Increments are summed into blocks of 20 ms in one pass, so that an hour needs little memory. The noise at rest
-is that of the quietest fifth of all seconds.
+Increments are summed into blocks of 20 ms in one pass. The noise at rest is that of the quietest fifth of all
+seconds, so the blocks are judged after the last one, a part of them at a time: the length of a capture hardly
+changes the memory needed.
 
     motion   rate above twice the Earth's and above the noise, or specific force different from that of the
              rest, or more than half a block missing; includes quiet intervals under a second
-    rest     the intervals between motions
+    rest     the intervals between motions; one of more than half an hour counts as several of equal length
 
 The angle of a motion is measured about the vertical in body axes (specific force of the rest before,
 propagated by the gyros); its axis is that of the sum of its angles. `calib.detection.acceptance` decides
 whether a motion is a rotation of the procedure.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from math import acos
 from typing import Final, NamedTuple
 
@@ -21,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.axes import axis_name
-from calib.detection.blocks import BLOCK, BLOCK_NS, join_blocks
+from calib.detection.blocks import BLOCK_NS, BlockStore, BlockSums
 from calib.detection.noise import (
     BIN_S,
     LAGS,
@@ -35,7 +37,7 @@ from imudrv.arrays import Array
 from imudrv.errors import InputError
 from imudrv.nav.attitude import conjugate, product, quaternion_of_vector, turn, unit
 from imudrv.nav.earth import EARTH_RATE
-from imudrv.records import Records
+from imudrv.records import INCREMENTS, Records
 from imudrv.units import DEG, NS, UG
 
 QUIET_S: Final = 1.0
@@ -50,9 +52,17 @@ LEAST_FORCE: Final = 300.0 * UG
 """Smallest change of specific force that counts as motion, m/s^2."""
 
 
+BLOCKS_AT_ONCE: Final = 90_000
+"""Most blocks that are judged together, and of a rest: half an hour."""
+
+
+_INTERVALS: Final = 16
+"""Samples whose shortest interval is that of the unit: a single one may bridge a gap."""
+
+
 @dataclass(frozen=True)
-class Rest:
-    """An interval at rest.
+class Interval:
+    """An interval of a capture.
 
     Attributes
     ----------
@@ -60,14 +70,6 @@ class Rest:
         Counter of the first sample, and of the first after the last.
     start_s, stop_s : float
         Time from the beginning of the capture, by the counter.
-    up : str
-        Body axis that points up, '+X' to '-Z'.
-    up_b : ndarray, shape (3,)
-        Unit vector up, body axes.
-    f_b : ndarray, shape (3,)
-        Mean specific force, m/s^2.
-    differences : SecondDifferences or None
-        For the noise; None: the rest is too short.
     missing : int
         Number of missing samples.
     """
@@ -76,16 +78,7 @@ class Rest:
     stop: int
     start_s: float
     stop_s: float
-    up: str
-    up_b: Array
-    f_b: Array
-    differences: SecondDifferences | None
     missing: int
-
-    @property
-    def noise(self) -> Noise | None:
-        """Noise of this rest, or None if it is too short."""
-        return pooled_noise([self.differences]) if self.differences else None
 
     @property
     def duration_s(self) -> float:
@@ -94,15 +87,35 @@ class Rest:
 
 
 @dataclass(frozen=True)
-class Rotation:
+class Rest(Interval):
+    """An interval at rest.
+
+    Attributes
+    ----------
+    up : str
+        Body axis that points up, '+X' to '-Z'.
+    up_b : ndarray, shape (3,)
+        Unit vector up, body axes.
+    differences : SecondDifferences or None
+        For the noise; None: the rest is too short.
+    """
+
+    up: str
+    up_b: Array
+    differences: SecondDifferences | None
+
+    @property
+    def noise(self) -> Noise | None:
+        """Noise of this rest, or None if it is too short."""
+        return pooled_noise([self.differences]) if self.differences else None
+
+
+@dataclass(frozen=True)
+class Rotation(Interval):
     """A motion between two rests; `calib.detection.acceptance.assess` accepts or rejects it.
 
     Attributes
     ----------
-    start, stop : int
-        Counter of the first sample, and of the first after the last.
-    start_s, stop_s : float
-        Time from the beginning of the capture, by the counter.
     before, after : Rest or None
         The rests before and after it; None: the capture begins or ends in motion.
     angle_deg : float
@@ -115,16 +128,10 @@ class Rotation:
         Angle between the rotation axis and the vertical, 0 to 90.
     peak_deg_per_s : float
         Largest rate of a block.
-    missing : int
-        Number of missing samples.
     flags : int
         `Flag` bits of any sample.
     """
 
-    start: int
-    stop: int
-    start_s: float
-    stop_s: float
     before: Rest | None
     after: Rest | None
     angle_deg: float
@@ -132,13 +139,7 @@ class Rotation:
     about: str
     axis_tilt_deg: float
     peak_deg_per_s: float
-    missing: int
     flags: int
-
-    @property
-    def duration_s(self) -> float:
-        """Length, s."""
-        return self.stop_s - self.start_s
 
 
 @dataclass(frozen=True)
@@ -147,8 +148,6 @@ class Segments:
 
     Attributes
     ----------
-    first : int
-        Counter of the first sample.
     interval_s : float
         Sample interval.
     duration_s : float
@@ -159,7 +158,6 @@ class Segments:
         Every motion, in order.
     """
 
-    first: int
     interval_s: float
     duration_s: float
     rests: tuple[Rest, ...]
@@ -170,10 +168,11 @@ class Segmenter:
     """Detector of rests and motions; the result does not depend on how the increments are divided."""
 
     def __init__(self) -> None:
-        self._blocks: list[Records] = []
-        self._first = 0
+        self._store = BlockStore()
+        self._sums: BlockSums | None = None
+        self._waiting = np.zeros(0, INCREMENTS)
+        self._first = self._last = 0
         self._nominal_ns = 0
-        self._last = 0
 
     def feed(self, increments: Records) -> None:
         """Process increments.
@@ -183,31 +182,17 @@ class Segmenter:
         increments : ndarray of INCREMENTS
             In order.
         """
-        if not len(increments):
-            return
-        counter = increments["counter"]
-        if not self._nominal_ns:
-            self._nominal_ns = int(increments["interval_ns"].min())
-            self._first = int(counter[0])
-        index = (counter - self._first) // self._samples_a_block
-        starts = np.concatenate([[0], np.flatnonzero(np.diff(index)) + 1])
-        samples = np.diff(starts, append=len(index))
-        blocks = np.zeros(len(starts), BLOCK)
-        blocks["index"], blocks["samples"] = index[starts], samples
-        blocks["interval_ns"] = np.add.reduceat(increments["interval_ns"], starts)
-        for whole, inside in (("dtheta_b", "angle"), ("dv_b", "velocity")):
-            sums = np.cumsum(increments[whole], axis=0)
-            at_end = sums[starts + samples - 1]
-            at_begin = np.concatenate([np.zeros((1, 3)), at_end[:-1]])
-            blocks[whole] = at_end - at_begin
-            blocks[inside] = np.add.reduceat(sums, starts, axis=0) - samples[:, None] * at_begin
-        blocks["flags"] = np.bitwise_or.reduceat(increments["flags"], starts)
-        if self._blocks and self._blocks[-1]["index"][-1] == blocks["index"][0]:
-            join_blocks(self._blocks[-1][-1:], blocks[:1])
-            blocks = blocks[1:]
-        if len(blocks):
-            self._blocks.append(blocks)
-        self._last = int(counter[-1])
+        if self._sums is None:
+            increments = self._waiting = np.concatenate([self._waiting, increments])
+            if len(increments) < _INTERVALS:
+                return
+            self._nominal_ns = int(increments["interval_ns"][:_INTERVALS].min())
+            self._first = int(increments["counter"][0])
+            self._sums = BlockSums(self._first, self._samples_a_block)
+            self._waiting = np.zeros(0, INCREMENTS)
+        if len(increments):
+            self._store.append(self._sums.feed(increments))
+            self._last = int(increments["counter"][-1])
 
     @property
     def _samples_a_block(self) -> int:
@@ -225,16 +210,17 @@ class Segmenter:
         InputError
             The capture is too short.
         """
-        blocks = np.concatenate(self._blocks) if self._blocks else np.zeros(0, BLOCK)
-        if len(blocks) * BLOCK_NS * NS < 2.0 * QUIET_S:
+        # The noise of the few samples of an incomplete block would look like motion.
+        incomplete = self._sums.incomplete if self._sums is not None else None
+        count = len(self._store) + (incomplete is not None)
+        if count * BLOCK_NS * NS < 2.0 * QUIET_S:
             raise InputError(
                 f"segments: expected a capture of at least {2.0 * QUIET_S:g} s, got "
-                f"{len(blocks) * BLOCK_NS * NS:.1f} s"
+                f"{count * BLOCK_NS * NS:.1f} s"
             )
-        size, end = self._samples_a_block, self._last + 1
-        if (end - self._first) % size:  # the noise of a few samples would look like motion
-            blocks, end = blocks[:-1], self._first + int(blocks["index"][-1]) * size
-        return _segments(_Blocks(blocks, size, self._first, end, self._nominal_ns * NS))
+        size = self._samples_a_block
+        end = self._last + 1 if incomplete is None else self._first + incomplete * size
+        return _segments(_Blocks(self._store, size, self._first, end, self._nominal_ns * NS))
 
 
 def find_segments(pieces: Iterable[Records]) -> Segments:
@@ -263,37 +249,50 @@ def find_segments(pieces: Iterable[Records]) -> Segments:
 class _Blocks(NamedTuple):
     """Blocks of a capture and their place on the counter."""
 
-    rows: Records  # BLOCK
+    store: BlockStore
     size: int  # samples per block
     first: int  # counter of the first sample
     end: int  # counter after the last sample
     interval_s: float
 
+    @property
+    def per_second(self) -> int:
+        """Blocks per second."""
+        return max(1, round(1.0 / (self.size * self.interval_s)))
+
+    def pieces(self, begin: int, stop: int, multiple: int = 1) -> Iterator[Records]:
+        """Yield the blocks from `begin` to `stop`, a multiple at a time, of at most `BLOCKS_AT_ONCE`."""
+        size = BLOCKS_AT_ONCE // multiple * multiple
+        for at in range(begin, stop, size):
+            yield self.store.rows(at, min(at + size, stop))
+
+    def interval(self, begin: int, stop: int) -> Interval:
+        """Return the interval of the blocks from `begin` to `stop`."""
+        first, end = self.counter(begin), self.counter(stop)
+        covered_ns = sum(int(rows["interval_ns"].sum()) for rows in self.pieces(begin, stop))
+        # A long interval covers samples that were missing.
+        missing = end - first - round(float(covered_ns) * NS / self.interval_s)
+        return Interval(first, end, self.seconds(begin), self.seconds(stop), missing)
+
     def counter(self, block: int) -> int:
         """Return the counter at a block's beginning."""
-        if block == len(self.rows):
+        if block == len(self.store):
             return self.end
-        return self.first + int(self.rows["index"][block]) * self.size
+        return self.first + int(self.store.rows(block, block + 1)["index"][0]) * self.size
 
     def seconds(self, block: int) -> float:
         """Return the time at a block's beginning, s."""
         return (self.counter(block) - self.first) * self.interval_s
 
-    def missing(self, begin: int, stop: int) -> int:
-        """Return the number of missing samples, except those that a long interval covers."""
-        covered = round(float(self.rows["interval_ns"][begin:stop].sum()) * NS / self.interval_s)
-        return self.counter(stop) - self.counter(begin) - covered
-
 
 def _segments(blocks: _Blocks) -> Segments:
     """Divide a capture into rests and rotations."""
     moving = _moving_mask(blocks)
-    still = _runs(moving, False)
+    still = _still(moving)
     rests = [_rest(blocks, begin, stop) for begin, stop in still]
     before = {stop: rest for (_, stop), rest in zip(still, rests, strict=True)}
     after = {begin: rest for (begin, _), rest in zip(still, rests, strict=True)}
     return Segments(
-        blocks.first,
         blocks.interval_s,
         (blocks.end - blocks.first) * blocks.interval_s,
         tuple(rests),
@@ -304,28 +303,53 @@ def _segments(blocks: _Blocks) -> Segments:
     )
 
 
+def _still(moving: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return begin and stop of the rests, the long ones in equal parts."""
+    parts = []
+    for begin, stop in _runs(moving, False):
+        count = -(-(stop - begin) // BLOCKS_AT_ONCE)
+        edges = [begin + k * (stop - begin) // count for k in range(count + 1)]
+        parts += list(pairwise(edges))
+    return parts
+
+
 def _moving_mask(blocks: _Blocks) -> NDArray[np.bool_]:
     """Return which blocks are in motion."""
-    rows = blocks.rows
-    dt = rows["interval_ns"][:, None] * NS
-    rate, force = rows["dtheta_b"] / dt, rows["dv_b"] / dt
-    per_second = max(1, round(1.0 / (blocks.size * blocks.interval_s)))
-    force_limit = LEAST_FORCE + SIGMAS * _noise_floor(force, per_second)
-    moving = np.linalg.norm(rate, axis=1) > 2.0 * EARTH_RATE + SIGMAS * _noise_floor(rate, per_second)
-    moving |= rows["interval_ns"] * NS < 0.5 * blocks.size * blocks.interval_s
-    moving[1:] |= np.diff(rows["index"]) > 1  # whole blocks are missing
-    for begin, stop in _runs(_merged(moving, blocks), False):
-        change = force[begin:stop] - np.median(force[begin:stop], axis=0)
-        moving[begin:stop] |= np.linalg.norm(change, axis=1) > force_limit
+    rate_noise, force_noise = _noise_floors(blocks)
+    masks, index = [], 0
+    for rows in blocks.pieces(0, len(blocks.store)):
+        rate = rows["dtheta_b"] / (rows["interval_ns"][:, None] * NS)
+        mask = np.linalg.norm(rate, axis=1) > 2.0 * EARTH_RATE + SIGMAS * rate_noise
+        mask |= rows["interval_ns"] * NS < 0.5 * blocks.size * blocks.interval_s
+        mask |= np.diff(rows["index"], prepend=index) > 1  # whole blocks are missing
+        masks.append(mask)
+        index = rows["index"][-1]
+    moving = np.concatenate(masks)
+    for begin, stop in _still(_merged(moving, blocks)):
+        rows = blocks.store.rows(begin, stop)
+        force = rows["dv_b"] / (rows["interval_ns"][:, None] * NS)
+        change = force - np.median(force, axis=0)
+        moving[begin:stop] |= np.linalg.norm(change, axis=1) > LEAST_FORCE + SIGMAS * force_noise
     return _merged(moving, blocks)
 
 
-def _noise_floor(x: Array, per_second: int) -> float:
-    """Return the rms about the mean of a second, of the quietest fifth of all seconds."""
+def _noise_floors(blocks: _Blocks) -> tuple[float, float]:
+    """Return the rms of rate and force about the mean of a second, of the quietest fifth of all seconds."""
+    per_second = blocks.per_second
+    rates, forces = [], []
+    for rows in blocks.pieces(0, len(blocks.store), per_second):
+        dt = rows["interval_ns"][:, None] * NS
+        rates.append(_rms_of_seconds(rows["dtheta_b"] / dt, per_second))
+        forces.append(_rms_of_seconds(rows["dv_b"] / dt, per_second))
+    rate, force = (float(np.quantile(np.concatenate(rms), 0.2)) for rms in (rates, forces))
+    return rate, force
+
+
+def _rms_of_seconds(x: Array, per_second: int) -> Array:
     n = len(x) // per_second
     seconds = x[: n * per_second].reshape(n, per_second, 3)
     deviation = seconds - seconds.mean(axis=1, keepdims=True)
-    return float(np.quantile(np.sqrt((deviation**2).sum(axis=2).mean(axis=1)), 0.2))
+    return np.asarray(np.sqrt((deviation**2).sum(axis=2).mean(axis=1)), np.float64)
 
 
 def _merged(moving: NDArray[np.bool_], blocks: _Blocks) -> NDArray[np.bool_]:
@@ -341,18 +365,13 @@ def _merged(moving: NDArray[np.bool_], blocks: _Blocks) -> NDArray[np.bool_]:
 
 
 def _rest(blocks: _Blocks, begin: int, stop: int) -> Rest:
-    rows = blocks.rows[begin:stop]
+    rows = blocks.store.rows(begin, stop)
     f_b = rows["dv_b"].sum(axis=0) / (rows["interval_ns"].sum() * NS)
     return Rest(
-        blocks.counter(begin),
-        blocks.counter(stop),
-        blocks.seconds(begin),
-        blocks.seconds(stop),
+        **vars(blocks.interval(begin, stop)),
         up=axis_name(f_b),
         up_b=f_b / np.linalg.norm(f_b),
-        f_b=f_b,
         differences=_second_differences(rows, round(BIN_S / (blocks.size * blocks.interval_s)), f_b),
-        missing=blocks.missing(begin, stop),
     )
 
 
@@ -381,39 +400,53 @@ def _block_means(rows: Records, whole: str, inside: str) -> Array:
 
 
 def _rotation(blocks: _Blocks, begin: int, stop: int, before: Rest | None, after: Rest | None) -> Rotation:
-    rows = blocks.rows[begin:stop]
-    dt = rows["interval_ns"][:, None] * NS
-    dtheta = rows["dtheta_b"]
-    q = (1.0, 0.0, 0.0, 0.0)  # from the body during the motion to the body before it
-    attitudes = []
-    for angle in map(tuple, dtheta.tolist()):
-        attitudes.append(q)  # for a fixed axis, up_b is the same at a block's beginning and in its middle
-        q = unit(product(q, quaternion_of_vector(angle)))
-    if before is not None:
-        up = before.up_b
-    elif after is not None:
-        up = np.array(turn(q, tuple(after.up_b.tolist())))
-    else:
-        mean = (rows["dv_b"] / dt).mean(axis=0)
-        up = mean / np.linalg.norm(mean)
-    up_b = np.array([turn(conjugate(attitude), tuple(up.tolist())) for attitude in attitudes])
-    total = dtheta.sum(axis=0)
+    up = _up_before(blocks, begin, stop, before, after)
+    q = _NO_ROTATION  # from the body during the motion to the body before it
+    angle, peak, total, flags = 0.0, 0.0, np.zeros(3), 0
+    for rows in blocks.pieces(begin, stop):
+        dtheta = rows["dtheta_b"]
+        attitudes = []
+        for turned in map(tuple, dtheta.tolist()):
+            attitudes.append(q)  # for a fixed axis, up_b is the same at a block's beginning and in its middle
+            q = unit(product(q, quaternion_of_vector(turned)))
+        up_b = np.array([turn(conjugate(attitude), tuple(up.tolist())) for attitude in attitudes])
+        angle += float((dtheta * up_b).sum())
+        total += dtheta.sum(axis=0)
+        rate = dtheta / (rows["interval_ns"][:, None] * NS)
+        peak = max(peak, float(np.linalg.norm(rate, axis=1).max()))
+        flags |= int(np.bitwise_or.reduce(rows["flags"]))
     size = float(np.linalg.norm(total)) or 1.0
     return Rotation(
-        blocks.counter(begin),
-        blocks.counter(stop),
-        blocks.seconds(begin),
-        blocks.seconds(stop),
-        before,
-        after,
-        angle_deg=float((dtheta * up_b).sum()) / DEG,
+        **vars(blocks.interval(begin, stop)),
+        before=before,
+        after=after,
+        angle_deg=angle / DEG,
         axis=axis_name(up),
         about=axis_name(total)[1],
         axis_tilt_deg=acos(min(1.0, abs(float(total @ up)) / size)) / DEG,
-        peak_deg_per_s=float(np.linalg.norm(dtheta / dt, axis=1).max()) / DEG,
-        missing=blocks.missing(begin, stop),
-        flags=int(np.bitwise_or.reduce(rows["flags"])),
+        peak_deg_per_s=peak / DEG,
+        flags=flags,
     )
+
+
+_NO_ROTATION: Final = (1.0, 0.0, 0.0, 0.0)
+
+
+def _up_before(blocks: _Blocks, begin: int, stop: int, before: Rest | None, after: Rest | None) -> Array:
+    """Return the unit vector up at the beginning of a motion, body axes."""
+    if before is not None:
+        return before.up_b
+    if after is not None:
+        q = _NO_ROTATION
+        for rows in blocks.pieces(begin, stop):
+            for turned in map(tuple, rows["dtheta_b"].tolist()):
+                q = unit(product(q, quaternion_of_vector(turned)))
+        return np.array(turn(q, tuple(after.up_b.tolist())))
+    force = np.zeros(3)
+    for rows in blocks.pieces(begin, stop):
+        force += (rows["dv_b"] / (rows["interval_ns"][:, None] * NS)).sum(axis=0)
+    mean = force / (stop - begin)
+    return np.asarray(mean / np.linalg.norm(mean), np.float64)
 
 
 def _runs(mask: NDArray[np.bool_], value: bool) -> list[tuple[int, int]]:

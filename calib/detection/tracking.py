@@ -12,6 +12,7 @@ import numpy as np
 
 from calib.axes import axis_name
 from calib.detection.blocks import BLOCK_NS, Block
+from calib.messages import Message, message
 from imudrv.arrays import Array
 from imudrv.nav.attitude import Quaternion, conjugate, product, quaternion_of_vector, turn, unit
 from imudrv.nav.earth import earth_rate_n
@@ -67,12 +68,13 @@ class StillnessDetector:
         return 1.0 - min(1.0, max(0.0, max(self._recent) - 1.0) / 9.0)
 
     @property
-    def why(self) -> str:
+    def why(self) -> Message:
         """Description of the latest motion, with value and limit."""
         if self._over >= self._off:
-            return f"{self._over * self._rate_limit / DEG:.2f} deg/s, limit {self._rate_limit / DEG:.2f}"
-        mg = self._force_limit / MG
-        return f"specific force {self._off * mg:.1f} mg off its mean, limit {mg:.1f}"
+            limit = self._rate_limit / DEG
+            return message("rate", rate_deg_per_s=self._over * limit, limit_deg_per_s=limit)
+        limit = self._force_limit / MG
+        return message("force", off_mg=self._off * limit, limit_mg=limit)
 
 
 class RestAverages:

@@ -76,14 +76,16 @@ class Dither:
     ----------
     axes_b : ndarray, shape (n, 3)
         Row j: u_j, body axes; unit vectors if a body turns.
-    amplitude_rad, frequency_hz, phase_rad : ndarray, shape (n,)
+    amplitude_rad, frequency_hz : ndarray, shape (n,)
         Angle a sin(2 pi f t + phase).
+    phase_rad : ndarray, shape (n,), or float
+        Its phase.
     """
 
     axes_b: Array
     amplitude_rad: Array
     frequency_hz: Array
-    phase_rad: Array
+    phase_rad: Array | float = 0.0
 
     @property
     def rate(self) -> Array:
@@ -97,49 +99,14 @@ class Dither:
         )
 
 
-def in_increments(
-    C_bg: ArrayLike, amplitude_rad: ArrayLike, frequency_hz: ArrayLike, phase_rad: ArrayLike = (0.0, 0.0, 0.0)
-) -> Dither:
-    """Return the dither of the blocks in the increments: gyro j along column j of C_bg.
+def sensing_directions(C_bg: Array) -> Array:
+    """Return the unit vectors along which the gyros sense, as rows in body axes: the rows of inv(C_bg).
 
-    Parameters
-    ----------
-    C_bg : array_like, shape (3, 3)
-        Gyro axes to body.
-    amplitude_rad, frequency_hz, phase_rad : array_like, shape (3,)
-        Angle of each block relative to the case, see `Dither`.
-
-    Returns
-    -------
-    Dither
+    The blocks themselves turn about the columns of C_bg.
     """
-    return Dither(np.asarray(C_bg, np.float64).T, *_each_gyro(amplitude_rad, frequency_hz, phase_rad))
-
-
-def of_case(
-    C_bg: ArrayLike, amplitude_rad: ArrayLike, frequency_hz: ArrayLike, phase_rad: ArrayLike = (0.0, 0.0, 0.0)
-) -> Dither:
-    """Return the dither of the case about the sensing directions of the gyros, rows of inv(C_bg).
-
-    Parameters
-    ----------
-    C_bg : array_like, shape (3, 3)
-        Gyro axes to body.
-    amplitude_rad, frequency_hz, phase_rad : array_like, shape (3,)
-        Angle of the case relative to inertial space, see `Dither`.
-
-    Returns
-    -------
-    Dither
-    """
-    senses_b = np.linalg.inv(np.asarray(C_bg, np.float64))
-    axes_b = senses_b / np.linalg.norm(senses_b, axis=1, keepdims=True)
-    return Dither(axes_b, *_each_gyro(amplitude_rad, frequency_hz, phase_rad))
-
-
-def _each_gyro(*values: ArrayLike) -> Iterator[Array]:
-    for value in values:
-        yield np.asarray(value, np.float64)
+    rows = np.linalg.inv(C_bg)
+    directions: Array = rows / np.linalg.norm(rows, axis=1, keepdims=True)
+    return directions
 
 
 @dataclass(frozen=True)

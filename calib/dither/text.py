@@ -1,12 +1,13 @@
 """The effect of dither as text."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from calib.certificate import lever_arms_of
-from calib.dither.spectrum import AXES, Dither, compensated, gain, in_increments, of_case, size_effect
+from calib.dither.spectrum import AXES, Dither, compensated, gain, sensing_directions, size_effect
 from imudrv.arrays import Array
 from imudrv.calibration import Calibration
 from imudrv.imu.rate_filter import RateFilter
@@ -47,10 +48,10 @@ def dither_text(
         The calibration has no lever arms.
     """
     arms = lever_arms_of(calibration, f"unit {calibration.serial_number}")
-    C_bg, geometry = calibration.gyro.C_bg_array, (calibration.accelerometer.C_ba_array, arms.r_b)
+    C_bg, geometry = np.array(calibration.gyro.C_bg), (np.array(calibration.accelerometer.C_ba), arms.r_b)
     amplitude = np.asarray(amplitude_arcsec, np.float64) * ARCSEC
-    block = in_increments(C_bg, amplitude, frequency_hz)
-    case = of_case(C_bg, reaction * amplitude, frequency_hz)
+    block = Dither(C_bg.T, amplitude, np.asarray(frequency_hz, np.float64))
+    case = replace(block, axes_b=sensing_directions(C_bg), amplitude_rad=reaction * amplitude)
 
     def lines() -> Iterator[str]:
         sizes = " ".join(f"{np.linalg.norm(r) / MM:.1f}" for r in arms.r_b)

@@ -151,9 +151,9 @@ def estimate_joint(
             for k, (run, part) in enumerate(zip(runs, system.parts, strict=True))
         ),
         notes=tuple(
-            f"{n.name} not observable in these runs: sigma {_format_parameter(n.name, n.sigma)}"
+            f"{n.name} not observable in these runs: sigma {n.sigma * STANDARD_GRAVITY**2 / UG:.3g} ug/g^2"
             for n in parameters
-            if n.name.split("_")[0] in extra and not n.observable
+            if n.name.startswith("quadratic") and not n.observable
         ),
     )
 
@@ -192,9 +192,3 @@ def _without(
     if rank < basis.shape[1]:
         return LeaveOneOut(label, rank, None)
     return LeaveOneOut(label, rank, (other.solve(basis)[0] - x)[:9].reshape(3, 3))
-
-
-def _format_parameter(name: str, value: float) -> str:
-    if name.startswith("skew"):
-        return f"{value * 1e3:.3g} ms"
-    return f"{value * STANDARD_GRAVITY**2 / UG:.3g} ug/g^2"

@@ -315,12 +315,9 @@ def velocity_at_rest(run: Run, R: Array) -> tuple[Array, Array, Array]:
 
 def run_result(run: Run, V: Array, H: Array, R: Array, t_s: Array, v_n: Array, fitted_n: Array) -> RunResult:
     """Return the result of one rotation."""
-    rotation = run.rotation
     H_rest = run.rows["H"][gain_rows(run)[0], :2].mean(axis=0)
     return RunResult(
         run.label,
-        rotation.axis,
-        rotation.angle_deg,
         V,
         H,
         V - H @ R,

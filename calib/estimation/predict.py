@@ -3,11 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import hypot, tan
-from typing import Final
+from typing import Final, get_args
 
 import numpy as np
 from scipy.spatial.transform import Rotation as Attitude
 
+from calib.axes import Side, vector
 from calib.detection.acceptance import AcceptedRotation
 from calib.detection.blocks import BLOCK_NS
 from calib.detection.noise import Noise
@@ -27,7 +28,7 @@ from imudrv.arrays import Array
 from imudrv.errors import InputError
 from imudrv.nav.alignment import ALIGNMENT_S, Aligned
 from imudrv.nav.earth import earth_rate_n, normal_gravity
-from imudrv.nav.mechanisation import Navigator
+from imudrv.nav.mechanisation import Navigator, Place
 from imudrv.records import INCREMENTS
 from imudrv.units import DEG, MM, NS
 
@@ -40,8 +41,8 @@ class PlannedRotation:
 
     Attributes
     ----------
-    up : str
-        Body axis that points up, '+X' to '-Z'.
+    up : {'+X', '-X', '+Y', '-Y', '+Z', '-Z'}
+        Body axis that points up.
     angle_deg : float
         Right-handed about up.
     duration_s : float
@@ -52,7 +53,7 @@ class PlannedRotation:
         Distance of the origin of b from the rotation axis; the effect of a skew is proportional to it.
     """
 
-    up: str
+    up: Side
     angle_deg: float = 180.0
     duration_s: float = 2.5
     after_s: float = 15.0
@@ -130,13 +131,12 @@ def _planned_run(planned: PlannedRotation, k: int, latitude_rad: float, priors: 
     """Return the ideal run of a planned rotation: level, about the vertical, without errors."""
     T, n = _PLAN_INTERVAL_NS * NS, round(planned.duration_s / (_PLAN_INTERVAL_NS * NS))
     before, after = round(BEFORE_S / T), round(min(planned.after_s, AFTER_S) / T)
-    up_b = np.array([planned.up == f"+{a}" for a in "XYZ"], np.float64)
-    up_b -= [planned.up == f"-{a}" for a in "XYZ"]
-    if not up_b.any() or n < 1 or after * T < GAIN_WINDOW_S:
+    if planned.up not in get_args(Side) or n < 1 or after * T < GAIN_WINDOW_S:
         raise InputError(
             f"plan: expected an axis up from +X to -Z, a duration, and a rest of at "
             f"least {GAIN_WINDOW_S:g} s, got {planned}"
         )
+    up_b = vector(planned.up)
     u = np.clip((np.arange(before + n + after + 1) - before) / n, 0.0, 1.0)
     angle = planned.angle_deg * DEG * u**3 * (10.0 - 15.0 * u + 6.0 * u * u)
     gravity = normal_gravity(latitude_rad, 0.0)
@@ -152,21 +152,30 @@ def _planned_run(planned: PlannedRotation, k: int, latitude_rad: float, priors: 
     v_n = np.gradient(turned.apply([planned.offset_m, 0.0, 0.0]), T, axis=0)
     increments["dv_b"] = gravity * T * up_b + C_nb[1:].inv().apply(np.diff(v_n, axis=0))
     q_nb = np.roll(C_nb0.as_quat(), 1)
-    navigator = Navigator(
-        latitude_rad, 0.0, 0.0, None, q_nb, C_ba=np.eye(3), every=BLOCK_NS // _PLAN_INTERVAL_NS
-    )
-    rows = navigator.feed(increments)
+    every = BLOCK_NS // _PLAN_INTERVAL_NS
+    rows = Navigator(Place(latitude_rad, 0.0, 0.0), q_nb, C_ba=np.eye(3), every=every).feed(increments)
     guard = round(GUARD_S / T)
     level = priors.accelerometer_bias / gravity
     heading = hypot(
         priors.gyro_bias / earth_rate_n(latitude_rad)[1],
         tan(latitude_rad) * priors.accelerometer_bias / gravity,
     )
-    rest = Rest(0, before, 0.0, before * T, planned.up, up_b, gravity * up_b, None, 0)
+    rest = Rest(0, before, 0.0, before * T, 0, planned.up, up_b, None)
     rotation = AcceptedRotation(
-        before, before + n, before * T, (before + n) * T, rest, rest, planned.angle_deg, planned.up,
-        planned.up[1], 0.0, 0.0, 0, 0,
-    )  # fmt: skip
+        before,
+        before + n,
+        before * T,
+        (before + n) * T,
+        missing=0,
+        before=rest,
+        after=rest,
+        angle_deg=planned.angle_deg,
+        axis=planned.up,
+        about=planned.up[1],
+        axis_tilt_deg=0.0,
+        peak_deg_per_s=0.0,
+        flags=0,
+    )
     return Run(
         f"plan#{k + 1}",
         rotation,

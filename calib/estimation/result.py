@@ -6,6 +6,7 @@ from typing import Final, Literal
 import numpy as np
 
 from calib.detection.noise import Noise
+from calib.lever_arms.gauge import LeverArms
 from imudrv.arrays import Array
 
 Extra = Literal["quadratic"]
@@ -67,10 +68,6 @@ class RunResult:
     ----------
     label : str
         Label of the run.
-    axis : str
-        Body axis that was up, '+X' to '-Z'.
-    angle_deg : float
-        Angle, right-handed about up.
     V_n : ndarray, shape (3,)
         Velocity gain of the rotation: mean over half a second after it minus that before it, east, north,
         up, m/s.
@@ -88,8 +85,6 @@ class RunResult:
     """
 
     label: str
-    axis: str
-    angle_deg: float
     V_n: Array
     H: Array
     compensated_n: Array
@@ -172,6 +167,11 @@ class LeverArmEstimate:
     leave_one_out: tuple[LeaveOneOut, ...]
     runs: tuple[RunResult, ...]
     notes: tuple[str, ...]
+
+    @property
+    def arms(self) -> LeverArms:
+        """The lever arms with covariance and gauge."""
+        return LeverArms(self.R_b, self.covariance, self.gauge)
 
     @property
     def sigma(self) -> Array:

@@ -6,7 +6,7 @@ gyro blocks is filtered from the angle increments. A capture is read twice: the 
 the second aligns and navigates, so that memory holds one chunk and the rows kept.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -18,12 +18,15 @@ from calib.detection.blocks import BLOCK_NS
 from calib.detection.segments import Segments, find_segments
 from calib.estimation.low_pass import without_dither
 from imudrv.arrays import Array
+from imudrv.calibration import Calibration, coefficients
 from imudrv.errors import InputError
+from imudrv.imu.compensation import Compensator
 from imudrv.nav.alignment import ALIGNMENT_S, MIN_ALIGNMENT_S, Aligned, Alignment
 from imudrv.nav.mechanisation import Navigator
 from imudrv.records import Records
 from imudrv.site import Site
 from imudrv.units import DEG_PER_H, MM, NS, PPM, STANDARD_GRAVITY, UG, URAD
+from imudrv.wire.layout import Layout
 
 BEFORE_S: Final = 10.0
 """Length of the rest before the rotation that is navigated, s."""
@@ -190,6 +193,47 @@ def navigate_rotations(
     return CaptureRuns(segments, tuple(builder.result() for builder in builders), tuple(rejected))
 
 
+def navigate_capture(
+    read: Callable[[], Iterable[Records]],
+    layout: Layout,
+    calibration: Calibration,
+    site: Site,
+    label: str = "",
+    options: NavigationOptions | None = None,
+) -> CaptureRuns:
+    """Compensate the pulses of a capture and navigate its rotations, see `navigate_rotations`.
+
+    Parameters
+    ----------
+    read : callable
+        Returns the capture's PULSES from the beginning, in pieces; called twice.
+    layout : Layout
+        Layout of the profile.
+    calibration : Calibration
+        Calibration of the unit. Lever arms are identified from runs without size effect.
+    site, label, options
+        See `navigate_rotations`.
+
+    Returns
+    -------
+    CaptureRuns
+
+    Raises
+    ------
+    InputError
+        See `navigate_rotations`.
+    """
+    known = coefficients(calibration)
+
+    def increments() -> Iterator[Records]:
+        compensator = Compensator(known, layout)
+        for pulses in read():
+            yield compensator.feed(pulses)
+        yield compensator.close()
+
+    return navigate_rotations(increments, known.C_ba, site, label, options)
+
+
 class _RunBuilder:
     """Aligns and navigates one rotation from the pieces of its capture."""
 
@@ -225,7 +269,7 @@ class _RunBuilder:
         if begin < stop:
             if self._started is None:
                 aligned = self._alignment.result()
-                self._started = aligned, Navigator.from_site(self._site, aligned.q_nb, C_ba=self._C_ba)
+                self._started = aligned, Navigator(self._site.place, aligned.q_nb, C_ba=self._C_ba)
             rows = self._started[1].feed(increments[max(first, begin) : stop])
             self._rows.append(rows[-(self._navigated + 1) % self._every :: self._every].copy())
             self._v_n.append(rows["v_n"].copy())

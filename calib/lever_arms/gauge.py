@@ -77,9 +77,7 @@ class LeverArms:
         return html_table(f"Lever arms, gauge {self.gauge}", ("mm", "X", "Y", "Z"), rows)
 
 
-def convert(
-    arms: LeverArms, to: Gauge, known_point: tuple[Literal["x", "y", "z"], ArrayLike] | None = None
-) -> LeverArms:
+def convert(arms: LeverArms, to: Gauge, known_point: tuple[str, ArrayLike] | None = None) -> LeverArms:
     """Convert lever arms to another gauge.
 
     Parameters
@@ -99,6 +97,12 @@ def convert(
     ------
     InputError
         Unknown gauge; `given` without a known point, or a known point with another gauge; invalid point.
+
+    Examples
+    --------
+    >>> arms = LeverArms(np.array([[24, -11, -9], [-23, 29, -7], [-1, -18, 16]]) * MM, None, "centroid")
+    >>> (convert(arms, "x").r_b / MM).round(9).tolist()  # x is the origin
+    [[0.0, 0.0, 0.0], [-47.0, 40.0, 2.0], [-25.0, -7.0, 25.0]]
     """
     if to not in GAUGES:
         raise InputError(f"gauge: expected one of {', '.join(GAUGES)}, got {to!r}")

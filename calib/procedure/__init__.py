@@ -6,9 +6,8 @@ engine       state machine: samples and keys in, events and a view out
 transitions  its table
 phases       what happens in each phase
 progress     state that the phases share
-attempt      evidence of one attempt at a step
+attempt      samples of one attempt at a step
 events       actions, events and views
 preflight    check of the sensors before the first step
 prompts      what the operator has to do
-messages     keys with values, and a catalogue for each language
 """

@@ -19,7 +19,7 @@ _BLOCKS_PER_PASS: Final = 500
 
 
 class Attempt:
-    """Evidence of one attempt, from the first sample at rest.
+    """Samples of one attempt, from the first sample at rest.
 
     Attributes
     ----------

@@ -19,6 +19,7 @@ from collections.abc import Mapping
 from calib.axes import side
 from calib.detection.blocks import Block, BlockSplitter
 from calib.detection.tracking import MG, AttitudeTracker, StillnessDetector
+from calib.messages import message, verbatim
 from calib.procedure.events import (
     Abort,
     Aborted,
@@ -36,7 +37,6 @@ from calib.procedure.events import (
     Skipped,
     View,
 )
-from calib.procedure.messages import message, verbatim
 from calib.procedure.phases import STATES, motion_limits
 from calib.procedure.plan import predicted
 from calib.procedure.progress import Progress
@@ -136,7 +136,7 @@ class Engine:
         return self._new_events()
 
     def reject(self, step_id: str, reason: str) -> tuple[Event, ...]:
-        """Withdraw an accepted step, because its evidence could not be stored; it has to be done again.
+        """Withdraw an accepted step, because its recording is not complete; it has to be done again.
 
         Parameters
         ----------
@@ -166,8 +166,6 @@ class Engine:
         duration_s = state.duration_s
         return View(
             phase=self._phase,
-            step=p.index + 1,
-            steps=steps,
             step_id=step.id,
             title=message("title", step=p.index + 1, steps=steps, side=side(step.up), turn_deg=step.turn_deg),
             headline=headline,
@@ -234,8 +232,8 @@ class Engine:
         if skipped:
             try:
                 predicted(p.procedure, p.site, skipped=skipped)
-            except InputError as error:
-                p.reasons = (verbatim(str(error)),)
+            except InputError:
+                p.reasons = (message("too_few_steps", steps=skipped),)
         p.bells += 1
         p.events.append(Finished(accepted, skipped, p.reasons, p.counter))
 

@@ -11,7 +11,7 @@ from typing import Final, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.procedure.messages import Message
+from calib.messages import Message
 from imudrv.arrays import Array
 
 PREFLIGHT: Final = "preflight"
@@ -33,19 +33,16 @@ class Phase(StrEnum):
 
 
 class Conditions(NamedTuple):
-    """Status of the unit beside its samples; once a second, or when it changes.
+    """Status of the unit beside its samples; once a second, or when the faults change.
 
     Parameters
     ----------
-    bits : tuple of str
-        Names of the status bits that are set.
     faults : tuple of str
-        Those that mean a fault.
+        Names of the status bits that are set and mean a fault.
     temperature_degc : mapping of str to float or None
         By channel; None: unknown.
     """
 
-    bits: tuple[str, ...] = ()
     faults: tuple[str, ...] = ()
     temperature_degc: Mapping[str, float | None] = {}
 
@@ -59,7 +56,7 @@ class Confirm:
 
 @dataclass(frozen=True)
 class Redo:
-    """Repeat a step, the current one or one that was accepted or skipped; evidence is kept."""
+    """Repeat a step, the current one or one that was accepted or skipped; all recordings are kept."""
 
     step_id: str
 
@@ -128,7 +125,7 @@ class Accepted:
     Attributes
     ----------
     first_counter, last_counter : int
-        First and last sample of the evidence: rest before, rotation, rest after, and nothing else.
+        First and last sample of the attempt: rest before, rotation, rest after, and nothing else.
     angle_deg, duration_s, peak_deg_per_s, axis_tilt_deg : float
         The rotation, as detected in these samples.
     rest_before_s, rest_after_s : float
@@ -140,7 +137,7 @@ class Accepted:
     v_n : tuple of 3 float
         Mean velocity east, north, up in the half second after the turn, m/s.
     samples : int or None
-        Number of samples of the evidence, fewer than the counters span where some were lost; None in the
+        Number of samples of the attempt, fewer than the counters span where some were lost; None in the
         journal of an older version.
     """
 
@@ -165,7 +162,7 @@ class Accepted:
 class Rejected:
     """An attempt, or the preflight (`step_id` is `PREFLIGHT`), is rejected.
 
-    It follows `Accepted` of the same attempt where the evidence could not be stored.
+    It follows `Accepted` of the same attempt where the recording is not complete.
     """
 
     step_id: str
@@ -260,8 +257,6 @@ class View:
     ----------
     phase : Phase
         Current phase.
-    step, steps : int
-        Number of the step, from 1, and number of steps.
     step_id : str
         Id of the step.
     title : Message
@@ -292,8 +287,6 @@ class View:
     """
 
     phase: Phase
-    step: int
-    steps: int
     step_id: str
     title: Message
     headline: Message

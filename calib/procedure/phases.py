@@ -12,10 +12,10 @@ from calib.detection.segments import LEAST_FORCE, QUIET_S, SIGMAS, Rotation
 from calib.detection.tracking import MG, RestAverages
 from calib.estimation.linear_system import GAIN_WINDOW_S
 from calib.estimation.runs import GUARD_S, Priors
+from calib.messages import Message, message, verbatim
 from calib.procedure import prompts
 from calib.procedure.attempt import Attempt
 from calib.procedure.events import PREFLIGHT, Accepted, Checked, Phase, Rejected
-from calib.procedure.messages import Message, message, verbatim
 from calib.procedure.preflight import PREFLIGHT_S, axis_faults, sensor_faults
 from calib.procedure.progress import Progress
 from calib.procedure.prompts import MIN_ROTATION_RAD, READY_S, Prompt
@@ -399,7 +399,7 @@ def _rejections(progress: Progress, rotation: Rotation | None, rest_after_s: flo
     if rotation is None:
         return (message("no_rotation"),)
     limits = replace(progress.procedure.rotation_limits(step), rest_after_s=rest_after_s)
-    reasons = tuple(map(verbatim, rejection_reasons(rotation, limits, step.up[1])))
+    reasons = rejection_reasons(rotation, limits, step.up[1])
     if rotation.angle_deg * np.sign(step.turn_deg) < -MIN_ROTATION_RAD / DEG:
         return (prompts.wrong_direction(rotation.angle_deg, step), *reasons)
     return reasons

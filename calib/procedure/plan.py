@@ -2,19 +2,20 @@
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
-from importlib import resources
 from pathlib import Path
 from typing import Final
 
 from calib.axes import opposite
 from calib.detection.noise import Noise
 from calib.estimation.predict import PlannedRotation, Prediction, predict
-from calib.estimation.runs import Priors
 from calib.procedure.schema import VERIFICATION, Pose, Procedure, Step
 from imudrv.errors import InputError
+from imudrv.files import shipped as shipped_files
 from imudrv.files.settings_file import SettingsFile, read_file
 from imudrv.site import Site
 from imudrv.units import DEG_PER_SQRT_H
+
+_FOLDER: Final = Path(__file__).parents[1] / "procedures"
 
 TURN_S: Final = 2.5
 """Duration of a rotation by hand from rest to rest, for predictions, s."""
@@ -26,14 +27,8 @@ TYPICAL_NOISE: Final = Noise(
 """Noise of a unit that was not measured yet; the beat of its pulses makes it quieter in some poses."""
 
 
-def predicted(
-    procedure: Procedure,
-    site: Site,
-    noise: Noise | None = None,
-    priors: Priors | None = None,
-    skipped: Collection[str] = (),
-) -> Prediction:
-    """Predict the accuracy of a procedure.
+def predicted(procedure: Procedure, site: Site, skipped: Collection[str] = ()) -> Prediction:
+    """Predict the accuracy of a procedure with a unit of `TYPICAL_NOISE`.
 
     Parameters
     ----------
@@ -41,10 +36,6 @@ def predicted(
         The plan.
     site : Site
         Location of the unit.
-    noise : Noise, optional
-        Noise of the sensors; `TYPICAL_NOISE` where it was not measured yet.
-    priors : Priors, optional
-        Residual errors of the static calibration.
     skipped : collection of str
         Ids of skipped steps.
 
@@ -64,7 +55,7 @@ def predicted(
         if step.id not in skipped
     ]
     try:
-        return predict(plan, site.latitude_rad, noise or TYPICAL_NOISE, priors)
+        return predict(plan, site.latitude_rad, TYPICAL_NOISE)
     except InputError as error:
         raise InputError(f"procedure {procedure.name}: {error}") from error
 
@@ -99,7 +90,7 @@ def _with_steps(procedure: Procedure, steps: Sequence[Step]) -> Procedure:
 
 def shipped() -> list[str]:
     """Return the names of the procedures that come with the package."""
-    return sorted(p.name.removesuffix(".yaml") for p in (resources.files("calib") / "procedures").iterdir())
+    return shipped_files.names(_FOLDER)
 
 
 def load(name_or_path: str) -> Procedure:
@@ -125,12 +116,4 @@ def load(name_or_path: str) -> Procedure:
 
 def load_file(name_or_path: str) -> SettingsFile[Procedure]:
     """Load a procedure with the content of its file; see `load`."""
-    if name_or_path in shipped():
-        with resources.as_file(resources.files("calib") / "procedures" / f"{name_or_path}.yaml") as path:
-            return read_file(path, Procedure)
-    if not Path(name_or_path).exists():
-        raise InputError(
-            f"procedure {name_or_path!r}: expected one of {', '.join(shipped())}, "
-            "or the path of a procedure file; there is no such file"
-        )
-    return read_file(name_or_path, Procedure)
+    return read_file(shipped_files.find("procedure", name_or_path, _FOLDER), Procedure)

@@ -6,6 +6,7 @@ well are reported as ambiguous: near the equator the Earth's rotation has no ver
 reversed level gyro looks like a unit with the opposite heading.
 """
 
+from collections.abc import Iterator
 from functools import reduce
 from itertools import combinations
 from math import acos, atan2, sin
@@ -15,8 +16,8 @@ import numpy as np
 
 from calib.axes import axis_name, side
 from calib.detection.tracking import MG, RestAverages
+from calib.messages import Message, message
 from calib.procedure.events import Conditions
-from calib.procedure.messages import Message, message
 from calib.procedure.prompts import fault_message, lean_message, turn_message
 from calib.procedure.schema import ProcedureLimits, Step
 from imudrv.arrays import Array
@@ -205,28 +206,17 @@ class _Pose:
         return message("ambiguous", causes=causes) if len(found) > 1 else causes
 
 
-def _mistakes() -> list[tuple[Array, Message, Message]]:
-    """Return what each mistake does to a vector, and its message for accelerometers and for gyros."""
-    reversed_axes = [
-        (
-            np.diag(np.where(np.arange(3) == k, -1.0, 1.0)),
-            message("accelerometer_reversed", axis=axis),
-            message("gyro_reversed", axis=axis),
-        )
-        for k, axis in enumerate("XYZ")
-    ]
-    exchanged = []
+def _mistakes() -> Iterator[tuple[Array, Message, Message]]:
+    """Yield what each mistake does to a vector, and its message for accelerometers and for gyros."""
+    for k, axis in enumerate("XYZ"):
+        P = np.eye(3)
+        P[k, k] = -1.0
+        yield P, message("accelerometer_reversed", axis=axis), message("gyro_reversed", axis=axis)
     for i, j in combinations(range(3), 2):
         P, first, second = np.eye(3), "XYZ"[i], "XYZ"[j]
         P[[i, j]] = P[[j, i]]
-        exchanged.append(
-            (
-                P,
-                message("accelerometers_exchanged", first=first, second=second),
-                message("gyros_exchanged", first=first, second=second),
-            )
-        )
-    return reversed_axes + exchanged
+        accelerometers = message("accelerometers_exchanged", first=first, second=second)
+        yield P, accelerometers, message("gyros_exchanged", first=first, second=second)
 
 
-_MISTAKES: Final = _mistakes()
+_MISTAKES: Final = tuple(_mistakes())

@@ -4,9 +4,9 @@ from dataclasses import dataclass, field
 
 from calib.detection.blocks import Block
 from calib.detection.tracking import AttitudeTracker, StillnessDetector
+from calib.messages import Message, message
 from calib.procedure.attempt import Attempt
 from calib.procedure.events import Accepted, Conditions, Event, NavigationLog, Rejected, Restarted
-from calib.procedure.messages import Message, message
 from calib.procedure.prompts import StepObservation
 from calib.procedure.schema import Procedure, Step
 from calib.procedure.transitions import Outcome
@@ -116,7 +116,7 @@ class Progress:
 
     def navigate(self, q_nb: Quaternion) -> None:
         """Start the navigation log of the attempt at rest, with this attitude."""
-        navigator = Navigator.from_site(self.site, q_nb, C_ba=self.calibration.accelerometer.C_ba_array)
+        navigator = Navigator(self.site.place, q_nb, C_ba=self.calibration.accelerometer.C_ba)
         self.attempt.navigate(navigator, turn(conjugate(q_nb), (0.0, 0.0, 1.0)))
 
     def restart(self, *reasons: Message) -> Outcome:
@@ -127,7 +127,7 @@ class Progress:
         return Outcome.DISTURBED
 
     def reject(self, *reasons: Message) -> Outcome:
-        """Report that the attempt is rejected, and drop its evidence."""
+        """Report that the attempt is rejected, and drop its samples."""
         self.events.append(Rejected(self.step.id, self.number, reasons, self.counter))
         self.bells += 1
         self.reasons = reasons

@@ -6,8 +6,8 @@ from typing import Final, NamedTuple
 
 from calib.axes import axis_name, opposite, side, vector
 from calib.detection.tracking import AttitudeTracker, RotationTracker, StillnessDetector
+from calib.messages import Message, message
 from calib.procedure.events import Accepted
-from calib.procedure.messages import Message, message
 from calib.procedure.schema import ProcedureLimits, Step
 from imudrv.records import Flag
 from imudrv.units import DEG

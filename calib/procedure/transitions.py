@@ -23,7 +23,7 @@ class Outcome(Enum):
     ALIGNED = auto()
     TURNED = auto()  # the rotation has ended within its limits
     ACCEPTED = auto()
-    REJECTED = auto()  # by its limits, or because the evidence could not be stored
+    REJECTED = auto()  # by its limits, or because its recording is not complete
     AGAIN = auto()  # another attempt, after a rejection or on request
     NEXT_STEP = auto()  # the step is accepted or skipped
     COMPLETED = auto()  # the same, and it was the last one

@@ -48,25 +48,16 @@ _STYLE: Final[dict[Any, Any]] = {
 }
 
 
-class _Canvas:
-    """A figure, and its SVG once it is complete."""
-
-    def __init__(self, figure: "Figure") -> None:
-        self.figure = figure
-        self.svg = b""
-
-
 @contextmanager
-def _canvas(height_in: float) -> Iterator[_Canvas]:
+def _drawing(height_in: float) -> Iterator[tuple["Figure", BytesIO]]:
+    """Give an empty figure, and write it as SVG to the stream once it is drawn."""
     from matplotlib import rc_context  # slow to import; not needed for text
     from matplotlib.figure import Figure
 
     with rc_context(_STYLE):
-        canvas = _Canvas(Figure(figsize=(WIDTH_IN, height_in), layout="constrained"))
-        yield canvas
-        out = BytesIO()
-        canvas.figure.savefig(out, format="svg", metadata={"Date": None})
-        canvas.svg = out.getvalue()
+        figure, svg = Figure(figsize=(WIDTH_IN, height_in), layout="constrained"), BytesIO()
+        yield figure, svg
+        figure.savefig(svg, format="svg", metadata={"Date": None})
 
 
 def sensing_points(r_b: Array, C_ba: Array) -> bytes:
@@ -89,35 +80,26 @@ def sensing_points(r_b: Array, C_ba: Array) -> bytes:
     shown = np.concatenate([points, points + arrows, np.zeros((1, 3))])
     middle = (shown.min(axis=0) + shown.max(axis=0)) / 2.0
     half = 0.6 * float(np.ptp(shown, axis=0).max())
-    with _canvas(2.7) as canvas:
+    with _drawing(2.7) as (figure, svg):
         # axes to the right and up on the paper, and the direction towards the viewer
         views = (
             ("from above", 0, 1, [0, 0, 1]),
             ("from behind", 0, 2, [0, -1, 0]),
             ("from the right", 1, 2, [1, 0, 0]),
         )
-        for axes, (title, h, v, viewer) in zip(canvas.figure.subplots(1, 3), views, strict=True):
+        for axes, (title, h, v, viewer) in zip(figure.subplots(1, 3), views, strict=True):
             axes.set_title(title)
             axes.plot(0.0, 0.0, "+", color=_GREY, markersize=9)
             for name, point, arrow, colour in zip("xyz", points, arrows, _COLOURS, strict=True):
-                axes.plot(point[h], point[v], "o", color=colour, markersize=5)
+                at, tip = point[[h, v]], (point + arrow)[[h, v]]
+                axes.plot(*at, "o", color=colour, markersize=5)
                 if np.hypot(arrow[h], arrow[v]) > 0.5 * np.linalg.norm(arrow):
-                    tip = (point[h] + arrow[h], point[v] + arrow[v])
-                    axes.annotate(
-                        "", tip, (point[h], point[v]), arrowprops={"arrowstyle": "->", "color": colour}
-                    )
+                    axes.annotate("", tip, at, arrowprops={"arrowstyle": "->", "color": colour})
                 else:
-                    axes.plot(point[h], point[v], "o", color=colour, markersize=11, fillstyle="none")
+                    axes.plot(*at, "o", color=colour, markersize=11, fillstyle="none")
                     if arrow @ viewer < 0.0:
-                        axes.plot(point[h], point[v], "x", color=colour, markersize=8)
-                axes.annotate(
-                    name,
-                    (point[h], point[v]),
-                    (-7, -10),
-                    textcoords="offset points",
-                    color=colour,
-                    weight="bold",
-                )
+                        axes.plot(*at, "x", color=colour, markersize=8)
+                axes.annotate(name, at, (-7, -10), textcoords="offset points", color=colour, weight="bold")
             axes.set(
                 xlim=(middle[h] - half, middle[h] + half),
                 ylim=(middle[v] - half, middle[v] + half),
@@ -125,7 +107,7 @@ def sensing_points(r_b: Array, C_ba: Array) -> bytes:
                 ylabel=f"{'XYZ'[v]} (mm)",
                 aspect="equal",
             )
-    return canvas.svg
+    return svg.getvalue()
 
 
 def velocities(run: Run, result: RunResult) -> bytes:
@@ -145,8 +127,8 @@ def velocities(run: Run, result: RunResult) -> bytes:
     """
     turned = (float(run.t_s[run.before][-1]), float(run.t_s[run.after][0]))
     before = result.t_s < turned[0]
-    with _canvas(2.2) as canvas:
-        left, right = canvas.figure.subplots(1, 2)
+    with _drawing(2.2) as (figure, svg):
+        left, right = figure.subplots(1, 2)
         for k, name in enumerate(("east", "north")):
             v, fitted = result.v_n[:, k] / MM, result.fitted_n[:, k] / MM
             left.plot(result.t_s, v, ".", color=_COLOURS[k], markersize=3, label=name)
@@ -159,7 +141,7 @@ def velocities(run: Run, result: RunResult) -> bytes:
             axes.axvspan(*turned, color="#eef0f3", linewidth=0)
             axes.set_xlabel("time from the start of navigation (s)")
         left.legend(loc="best", fontsize=7)
-    return canvas.svg
+    return svg.getvalue()
 
 
 def before_after(runs: Sequence[RunResult]) -> bytes:
@@ -175,8 +157,8 @@ def before_after(runs: Sequence[RunResult]) -> bytes:
     bytes
         SVG.
     """
-    with _canvas(0.7 + 0.32 * len(runs)) as canvas:
-        axes: Axes = canvas.figure.subplots()
+    with _drawing(0.7 + 0.32 * len(runs)) as (figure, svg):
+        axes: Axes = figure.subplots()
         at = np.arange(len(runs))
         for k, (name, values) in enumerate(
             (
@@ -192,7 +174,7 @@ def before_after(runs: Sequence[RunResult]) -> bytes:
         axes.invert_yaxis()
         axes.grid(visible=False, axis="y")
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7)
-    return canvas.svg
+    return svg.getvalue()
 
 
 def navigations(
@@ -215,8 +197,8 @@ def navigations(
         SVG.
     """
     step = max(1, len(t_s) // POINTS)
-    with _canvas(4.2) as canvas:
-        panels = canvas.figure.subplots(3, 1, sharex=True)
+    with _drawing(4.2) as (figure, svg):
+        panels = figure.subplots(3, 1, sharex=True)
         for k, (axes, name) in enumerate(zip(panels, ("east", "north", "up"), strict=True)):
             if moved_s is not None:
                 axes.axvspan(*moved_s, color="#eef0f3", linewidth=0)
@@ -225,7 +207,7 @@ def navigations(
             axes.set_ylabel(f"{name} (m/s)")
         panels[0].legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, fontsize=7)
         panels[-1].set_xlabel("time from the end of the alignment (s)")
-    return canvas.svg
+    return svg.getvalue()
 
 
 def directions(sigma: Array, rank: int, limit_m: float) -> bytes:
@@ -245,8 +227,8 @@ def directions(sigma: Array, rank: int, limit_m: float) -> bytes:
     bytes
         SVG.
     """
-    with _canvas(1.9) as canvas:
-        axes: Axes = canvas.figure.subplots()
+    with _drawing(1.9) as (figure, svg):
+        axes: Axes = figure.subplots()
         at = np.arange(1, len(sigma) + 1)
         axes.axhline(limit_m / MM, color=_COLOURS[1], linestyle="--", label="limit")
         axes.semilogy(at[:rank], sigma[:rank] / MM, "o", color=_COLOURS[0], label="observable")
@@ -254,4 +236,4 @@ def directions(sigma: Array, rank: int, limit_m: float) -> bytes:
         axes.set(xlabel="principal direction of (r_x, r_y, r_z)", ylabel="sigma (mm)")
         axes.set_xticks(at)
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7)
-    return canvas.svg
+    return svg.getvalue()

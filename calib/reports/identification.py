@@ -16,6 +16,7 @@ from calib.estimation.result import LeverArmEstimate, ParameterEstimate, RunResu
 from calib.estimation.runs import Priors, Run
 from calib.identification import CaptureSummary, IdentificationResult, scatter
 from calib.lever_arms.gauge import LeverArms
+from calib.messages import english
 from calib.reports import figures
 from calib.reports.document import Block, Document, Figure, KeyValues, Paragraph, Section, Table, sanitise
 from calib.reports.format import counted, decimals, mm, three_digits
@@ -25,12 +26,12 @@ from imudrv.arrays import Array
 from imudrv.units import ARCSEC, DEG, DEG_PER_H, MM, PPM, STANDARD_GRAVITY, UG, URAD
 
 
-def document(findings: IdentificationResult, arms: Sequence[LeverArms]) -> Document:
+def document(identification: IdentificationResult, arms: Sequence[LeverArms]) -> Document:
     """Return the report of an identification.
 
     Parameters
     ----------
-    findings : IdentificationResult
+    identification : IdentificationResult
         Result of the identification.
     arms : sequence of LeverArms
         The lever arms in each gauge to be shown, the requested one first.
@@ -40,23 +41,23 @@ def document(findings: IdentificationResult, arms: Sequence[LeverArms]) -> Docum
     Document
     """
     return Document(
-        f"Inner lever arms of unit {sanitise(findings.basis.calibration.serial_number)}",
-        f"Identification of {findings.created:%Y-%m-%d %H:%M} UTC, {findings.software}",
+        f"Inner lever arms of unit {sanitise(identification.prior_calibration.calibration.serial_number)}",
+        f"Identification of {identification.created:%Y-%m-%d %H:%M} UTC, {identification.software}",
         (
-            Section("Result", tuple(_result(findings, arms))),
-            Section("Input data", tuple(_inputs(findings))),
-            Section("Rotations", tuple(_rotations(findings))),
-            Section("Rejected motions", tuple(_rejected(findings.sources))),
-            Section("Velocity before and after compensation", tuple(_velocities(findings.result))),
-            Section("The estimate", tuple(_estimate(findings))),
-            Section("Limits", tuple(Paragraph(text) for text in _limits(findings, arms[0]))),
+            Section("Result", tuple(_result(identification, arms))),
+            Section("Input data", tuple(_inputs(identification))),
+            Section("Rotations", tuple(_rotations(identification))),
+            Section("Rejected motions", tuple(_rejected(identification.sources))),
+            Section("Velocity before and after compensation", tuple(_velocities(identification.result))),
+            Section("The estimate", tuple(_estimate(identification))),
+            Section("Limits", tuple(Paragraph(text) for text in _limits(identification, arms[0]))),
         ),
     )
 
 
-def report_html(findings: IdentificationResult, arms: Sequence[LeverArms]) -> str:
+def report_html(identification: IdentificationResult, arms: Sequence[LeverArms]) -> str:
     """Return the report as one HTML file with its figures, see `document`."""
-    return as_html(document(findings, arms))
+    return as_html(document(identification, arms))
 
 
 def arms_text(arms: LeverArms) -> str:
@@ -64,9 +65,9 @@ def arms_text(arms: LeverArms) -> str:
     return blocks_text([_arms_table(arms)])
 
 
-def _result(findings: IdentificationResult, arms: Sequence[LeverArms]) -> Iterator[Block]:
-    result = findings.result
-    yield KeyValues(tuple(verdict(findings)))
+def _result(identification: IdentificationResult, arms: Sequence[LeverArms]) -> Iterator[Block]:
+    result = identification.result
+    yield KeyValues(tuple(verdict(identification)))
     yield Paragraph("u is the standard uncertainty (k = 1), U the expanded one (k = 2).")
     yield from map(_arms_table, arms)
     sigma = result.differences_sigma
@@ -85,7 +86,7 @@ def _result(findings: IdentificationResult, arms: Sequence[LeverArms]) -> Iterat
             for j, axis in enumerate("XYZ")
         ),
     )
-    C_ba = findings.basis.calibration.accelerometer.C_ba_array
+    C_ba = np.array(identification.prior_calibration.calibration.accelerometer.C_ba)
     yield Figure(
         f"Sensing points, gauge {arms[0].gauge}, and sensing directions. Grey cross: origin of the body "
         "frame; dot in a circle: towards the reader, cross in a circle: away",
@@ -111,12 +112,12 @@ def _arms_table(arms: LeverArms) -> Table:
     )
 
 
-def verdict(findings: IdentificationResult) -> Iterator[tuple[str, str]]:
+def verdict(identification: IdentificationResult) -> Iterator[tuple[str, str]]:
     """Evaluate an identification.
 
     Parameters
     ----------
-    findings : IdentificationResult
+    identification : IdentificationResult
         Result of the identification.
 
     Yields
@@ -124,7 +125,7 @@ def verdict(findings: IdentificationResult) -> Iterator[tuple[str, str]]:
     (str, str)
         'good', 'note', 'caution' or 'bad', and a sentence that gives the reason.
     """
-    result = findings.result
+    result = identification.result
     worst = float(result.differences_sigma.max())
     nine = result.gauge == "given"
     yield (
@@ -145,7 +146,7 @@ def verdict(findings: IdentificationResult) -> Iterator[tuple[str, str]]:
                 "These rotations do not determine the gyro-accelerometer skew; the uncertainties include one "
                 f"of {n.prior * 1e3:g} ms (1 sigma).",
             )
-    for k, run in enumerate(findings.runs):
+    for k, run in enumerate(identification.runs):
         if run.aligned.motion is not None:
             yield "caution", f"Run {k + 1} moved during its alignment: {sanitise(run.aligned.motion)}."
     for note in result.notes:
@@ -195,14 +196,14 @@ def _agreement(result: LeverArmEstimate) -> tuple[str, str]:
     return "good", f"The velocities agree with the model: {statistic}."
 
 
-def _inputs(findings: IdentificationResult) -> Iterator[Block]:
-    basis, site, result = findings.basis, findings.site, findings.result
+def _inputs(identification: IdentificationResult) -> Iterator[Block]:
+    prior, site, result = identification.prior_calibration, identification.site, identification.result
     gravity = "normal gravity" if site.gravity_m_s2 is None else f"gravity {site.gravity_m_s2:.6f} m/s^2"
     yield KeyValues(
         (
-            ("unit", sanitise(basis.calibration.serial_number)),
-            ("calibration", f"{sanitise(basis.name)} of {basis.calibration.created:%Y-%m-%d}"),
-            ("SHA-256", basis.sha256),
+            ("unit", sanitise(prior.calibration.serial_number)),
+            ("calibration", f"{sanitise(prior.name)} of {prior.calibration.created:%Y-%m-%d}"),
+            ("SHA-256", prior.sha256),
             (
                 "site",
                 f"latitude {site.latitude_deg:.6f} deg, longitude {site.longitude_deg:.6f} deg, "
@@ -212,7 +213,7 @@ def _inputs(findings: IdentificationResult) -> Iterator[Block]:
             ("pivot", "at rest at the origin of the body frame" if result.gauge == "given" else "unknown"),
         )
     )
-    for source in findings.sources:
+    for source in identification.sources:
         warm = ", ".join(
             f"{channel.replace('_', ' ')} {least:.1f} to {most:.1f}"
             for channel, least, most in source.temperatures
@@ -222,14 +223,14 @@ def _inputs(findings: IdentificationResult) -> Iterator[Block]:
             (
                 ("capture", sanitise(", ".join(parts))),
                 ("SHA-256", source.sha256),
-                ("contents", f"{source.evidence.segments.duration_s:.1f} s; {source.counts}"),
+                ("contents", f"{source.rotations.segments.duration_s:.1f} s; {source.counts}"),
                 ("temperature", f"{warm} degC" if warm else "not reported by the unit"),
             )
         )
 
 
-def _rotations(findings: IdentificationResult) -> Iterator[Block]:
-    limits = findings.limits
+def _rotations(identification: IdentificationResult) -> Iterator[Block]:
+    limits = identification.limits
     yield Paragraph(
         f"A rotation is accepted if its angle is {limits.angle_deg:g} +- {limits.angle_tolerance_deg:g} deg, "
         f"its peak rate at least {limits.least_peak_deg_per_s:g} deg/s, its axis at most "
@@ -237,7 +238,9 @@ def _rotations(findings: IdentificationResult) -> Iterator[Block]:
         f"{limits.rest_before_s:g} s and the rest after it at least {limits.rest_after_s:g} s long, with at "
         f"most {counted(limits.missing, 'missing sample')}, no saturation and no fault reported by the unit."
     )
-    for number, (run, result) in enumerate(zip(findings.runs, findings.result.runs, strict=True), start=1):
+    for number, (run, result) in enumerate(
+        zip(identification.runs, identification.result.runs, strict=True), start=1
+    ):
         yield KeyValues(((f"run {number}", sanitise(run.label)), *_rotation(run)))
         yield _velocity_and_design(result)
         yield Figure(
@@ -287,7 +290,7 @@ def _velocity_and_design(result: RunResult) -> Table:
 
 
 def _rejected(sources: Sequence[CaptureSummary]) -> Iterator[Block]:
-    rejected = [(source.name, *one) for source in sources for one in source.evidence.rejected]
+    rejected = [(source.name, *one) for source in sources for one in source.rotations.rejected]
     for name, rotation, reasons in rejected:
         yield KeyValues(
             (
@@ -296,7 +299,7 @@ def _rejected(sources: Sequence[CaptureSummary]) -> Iterator[Block]:
                     f"{sanitise(name)} from {rotation.start_s:.1f} to {rotation.stop_s:.1f} s, "
                     f"{rotation.angle_deg:+.1f} deg about {rotation.axis} up",
                 ),
-                *(("rejected", reason) for reason in reasons),
+                *(("rejected", english(reason)) for reason in reasons),
             )
         )
     if not rejected:
@@ -331,12 +334,12 @@ def _speed(v_n: Array) -> float:
     return hypot(v_n[0], v_n[1])
 
 
-def _estimate(findings: IdentificationResult) -> Iterator[Block]:
-    result = findings.result
-    yield from _observability(result, findings.priors.arm)
+def _estimate(identification: IdentificationResult) -> Iterator[Block]:
+    result = identification.result
+    yield from _observability(result, identification.priors.arm)
     yield Paragraph(f"Consistency. {_agreement(result)[1]}")
     yield _noise(result)
-    yield Table("Prior uncertainties", ("", "u"), tuple(priors_rows(findings.priors)))
+    yield Table("Prior uncertainties", ("", "u"), tuple(priors_rows(identification.priors)))
     if result.parameters:
         names = _names(result)
         yield Table(
@@ -344,7 +347,7 @@ def _estimate(findings: IdentificationResult) -> Iterator[Block]:
             ("", "value", "u", "prior u", ""),
             tuple(_parameter(n, name) for n, name in zip(result.parameters, names, strict=True)),
         )
-        yield _correlations(findings, names)
+        yield _correlations(identification, names)
     if result.leave_one_out:
         yield _leave_one_out(result)
 
@@ -401,8 +404,8 @@ def _leave_one_out(result: LeverArmEstimate) -> Table:
     )
 
 
-def _correlations(findings: IdentificationResult, names: Sequence[str]) -> Table:
-    correlation = findings.differences_correlation
+def _correlations(identification: IdentificationResult, names: Sequence[str]) -> Table:
+    correlation = identification.differences_correlation
     largest = np.argsort(-np.abs(correlation), axis=1)[:, :2]
     return Table(
         "Correlation of the differences with these parameters: the two largest",
@@ -417,8 +420,8 @@ def _correlations(findings: IdentificationResult, names: Sequence[str]) -> Table
     )
 
 
-def _limits(findings: IdentificationResult, arms: LeverArms) -> Iterator[str]:
-    if findings.result.gauge != "given":
+def _limits(identification: IdentificationResult, arms: LeverArms) -> Iterator[str]:
+    if identification.result.gauge != "given":
         yield (
             "A common shift of the three sensing points is not known: rotations between rests determine only "
             "their differences. The gauge fixes the origin of the body frame. Another gauge changes "

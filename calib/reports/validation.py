@@ -6,18 +6,18 @@ from math import nan
 from calib.reports import figures
 from calib.reports.document import Block, Document, Figure, KeyValues, Paragraph, Section, Table, sanitise
 from calib.reports.format import mm
-from calib.validation.trial import FAST_DEG_PER_S, FIRST_S, Trial
-from calib.validation.verdict import MAX_CHANGE, MIN_REDUCTION, TrialMetrics
+from calib.validation.trial import FAST_DEG_PER_S, FIRST_S
+from calib.validation.verdict import MAX_CHANGE, MIN_REDUCTION, Validation
 
 
-def document(unit: str, trials: Sequence[tuple[Trial, TrialMetrics]], drawn: int) -> Document:
+def document(unit: str, validations: Sequence[Validation], drawn: int) -> Document:
     """Return the report of a validation.
 
     Parameters
     ----------
     unit : str
         Name of the unit, for the title.
-    trials : sequence of (Trial, TrialMetrics)
+    validations : sequence of Validation
         The trials in their order.
     drawn : int
         Number of trials, from the first, that get a section with tables and a figure.
@@ -30,50 +30,48 @@ def document(unit: str, trials: Sequence[tuple[Trial, TrialMetrics]], drawn: int
         f"Validation of {sanitise(unit)}",
         "Velocity error at rest without (Normal) and with size-effect compensation (Compensation)",
         (
-            Section("Verdicts", tuple(_verdicts(trials))),
+            Section("Verdicts", tuple(_verdicts(validations))),
             Section("Method", tuple(Paragraph(text) for text in _method())),
-            *(
-                Section(sanitise(trial.name), tuple(_trial(trial, metrics)))
-                for trial, metrics in trials[:drawn]
-            ),
+            *(Section(sanitise(one.trial.name), tuple(_trial(one))) for one in validations[:drawn]),
         ),
     )
 
 
-def verdict(trial: Trial, metrics: TrialMetrics) -> tuple[str, str]:
+def verdict(validation: Validation) -> tuple[str, str]:
     """Return the verdict on a trial: 'good' or 'bad', and a sentence that gives the reason."""
-    mark = "good" if metrics.good else "bad"
-    if metrics.expected == "reduced":
+    v, name = validation, sanitise(validation.trial.name)
+    mark = "good" if v.good else "bad"
+    if v.trial.expected == "reduced":
         return mark, (
-            f"{sanitise(trial.name)}: horizontal velocity right after the motion "
-            f"{mm(metrics.first[0])} mm/s without, {mm(metrics.first[1])} mm/s with compensation: "
-            f"reduced by {metrics.reduction:.2%}, required {MIN_REDUCTION:.0%}."
+            f"{name}: horizontal velocity right after the motion "
+            f"{mm(v.first[0])} mm/s without, {mm(v.first[1])} mm/s with compensation: "
+            f"reduced by {v.reduction:.2%}, required {MIN_REDUCTION:.0%}."
         )
     return mark, (
-        f"{sanitise(trial.name)}: compensation changes the horizontal velocity by "
-        f"{mm(metrics.change, '.3f')} mm/s rms; required less than {MAX_CHANGE:.0%} of the "
-        f"{mm(metrics.whole[0], '.3f')} mm/s without it, and less than the {mm(metrics.noise, '.3f')} mm/s "
+        f"{name}: compensation changes the horizontal velocity by "
+        f"{mm(v.change, '.3f')} mm/s rms; required less than {MAX_CHANGE:.0%} of the "
+        f"{mm(v.whole[0], '.3f')} mm/s without it, and less than the {mm(v.noise, '.3f')} mm/s "
         "of the sensor noise."
     )
 
 
-def _verdicts(trials: Sequence[tuple[Trial, TrialMetrics]]) -> Iterator[Block]:
-    yield KeyValues(tuple(verdict(trial, metrics) for trial, metrics in trials))
-    moved = [(trial, motion) for trial, _ in trials if (motion := trial.normal.aligned.motion)]
+def _verdicts(validations: Sequence[Validation]) -> Iterator[Block]:
+    yield KeyValues(tuple(map(verdict, validations)))
+    moved = [(one.trial.name, motion) for one in validations if (motion := one.trial.normal.aligned.motion)]
     if moved:
-        yield KeyValues(tuple(("caution", sanitise(f"{trial.name}: {motion}")) for trial, motion in moved))
+        yield KeyValues(tuple(("caution", sanitise(f"{name}: {motion}")) for name, motion in moved))
     yield Table(
         f"Horizontal velocity, mm/s: mean over the first {FIRST_S:g} s after the motion; then rms "
         "difference from the twin over the whole rest after it",
         ("", "Normal", "Comp.", "twin", "reduced", "Normal", "Comp."),
         tuple(
             (
-                sanitise(trial.name),
-                *(mm(v) for v in metrics.first),
-                f"{metrics.reduction:.2%}" if metrics.expected == "reduced" else "",
-                *(mm(v) for v in metrics.effect),
+                sanitise(one.trial.name),
+                *(mm(v) for v in one.first),
+                f"{one.reduction:.2%}" if one.trial.expected == "reduced" else "",
+                *(mm(v) for v in one.effect),
             )
-            for trial, metrics in trials
+            for one in validations
         ),
     )
 
@@ -97,13 +95,14 @@ def _method() -> Iterator[str]:
     )
 
 
-def _trial(trial: Trial, metrics: TrialMetrics) -> Iterator[Block]:
+def _trial(validation: Validation) -> Iterator[Block]:
+    trial = validation.trial
     yield Table(
         f"Velocity after the motion, mean over the first {FIRST_S:g} s, mm/s",
         ("", "east", "north", "up"),
         tuple(
             (name, *(mm(v, "+.2f") for v in row))
-            for name, row in zip(("Normal", "Compensation"), metrics.first_n, strict=True)
+            for name, row in zip(("Normal", "Compensation"), validation.first_n, strict=True)
         ),
     )
     yield Table(
@@ -112,11 +111,11 @@ def _trial(trial: Trial, metrics: TrialMetrics) -> Iterator[Block]:
         tuple(
             (name, *(mm(v) for v in values))
             for name, values in (
-                ("Normal", (metrics.before[0], metrics.whole[0], metrics.effect[0])),
-                ("Compensation", (metrics.before[1], metrics.whole[1], metrics.effect[1])),
-                ("twin", (nan, metrics.whole[2], nan)),
-                ("change", (nan, metrics.change, nan)),
-                ("noise", (nan, metrics.noise, nan)),
+                ("Normal", (validation.before[0], validation.whole[0], validation.effect[0])),
+                ("Compensation", (validation.before[1], validation.whole[1], validation.effect[1])),
+                ("twin", (nan, validation.whole[2], nan)),
+                ("change", (nan, validation.change, nan)),
+                ("noise", (nan, validation.noise, nan)),
             )
         ),
     )

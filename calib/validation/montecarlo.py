@@ -7,7 +7,7 @@ A longer alignment would take time and change little: the rests next to the rota
 """
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Final
@@ -15,23 +15,18 @@ from typing import Any, Final
 import numpy as np
 from scipy.stats import chi2
 
-from calib.certificate import lever_arms_of
+from calib.certificate import lever_arms_of, sensing_points
 from calib.estimation.joint import estimate_joint
 from calib.estimation.plain import estimate_plain
 from calib.estimation.result import TO_DIFFERENCES, LeverArmEstimate
-from calib.estimation.runs import NavigationOptions, Priors, Run, navigate_rotations
-from imudrv import profiles
+from calib.estimation.runs import NavigationOptions, Priors, Run, navigate_capture
+from calib.validation.simulate import LAYOUT, simulated_pulses, true_calibration
 from imudrv.arrays import Array
-from imudrv.calibration import Calibration, coefficients
+from imudrv.calibration import Calibration, SizeEffect
 from imudrv.files.settings_file import parse
-from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import rate_filter
-from imudrv.records import Flag, Records
 from imudrv.sim.scenario import NOMINAL, Residuals, Scenario, Unit
-from imudrv.sim.unit import draw_true_unit, simulate
-from imudrv.units import ARCSEC, DEG, DEG_PER_H, MM, UG, URAD
+from imudrv.units import DEG, MM, UG, URAD
 
-LAYOUT: Final = profiles.load("imu50-rs422").layout()
 REST_S: Final = 60.0
 """Rest before a rotation, s."""
 
@@ -103,21 +98,10 @@ def true_unit(seed: int, budget: Budget) -> Calibration:
         accelerometer_scale_ppm=20.0,
         accelerometer_misalignment_urad=budget.misalignment_urad,
     )
-    nominal = scenario(seed, NOMINAL, "z_up", 1, budget)
-    real = draw_true_unit(nominal.model_copy(update={"unit": Unit(residuals=residuals)}))
-    document = json.loads(NOMINAL.model_dump_json(exclude_none=True))
-    document["gyro"] = {
-        "scale_arcsec_per_pulse": (real.gyro_scale / ARCSEC).tolist(),
-        "bias_deg_per_h": (real.gyro_bias / DEG_PER_H).tolist(),
-        "C_bg": real.C_bg.tolist(),
-    }
-    document["accelerometer"] = {
-        "scale_pulse_per_m_s": real.accelerometer_scale.tolist(),
-        "bias_ug": (real.accelerometer_bias / UG).tolist(),
-        "C_ba": real.C_ba.tolist(),
-    }
-    document["size_effect"] = {"r_mm": dict(zip("xyz", arms.tolist(), strict=True)), "gauge": "centroid"}
-    return parse(document, Calibration, "unit")
+    drawn_from = scenario(seed, NOMINAL, "z_up", 1, budget)
+    real = true_calibration(Unit(residuals=residuals), drawn_from.seed)
+    effect = SizeEffect(r_mm=sensing_points(arms), gauge="centroid")
+    return real.model_copy(update={"size_effect": effect})
 
 
 def scenario(seed: int, calibration: Calibration, pose: str, sign: int, budget: Budget) -> Scenario:
@@ -147,15 +131,6 @@ def scenario(seed: int, calibration: Calibration, pose: str, sign: int, budget: 
     return parse(document, Scenario, "montecarlo")
 
 
-def increments(turn: Scenario) -> Records:
-    """Return the increments of the nominal calibration, without size-effect compensation."""
-    bare = coefficients(NOMINAL.without_size_effect())
-    compensator = Compensator(bare, LAYOUT, rate_filter("causal", LAYOUT.interval_ns))
-    pulses = np.concatenate([chunk.pulses for chunk in simulate(turn, LAYOUT.interval_ns)])
-    pulses["flags"] = Flag.VALID
-    return compensator.feed(pulses)
-
-
 def case(seed: int, signs: tuple[int, ...], budget: Budget) -> tuple[list[Run], Array]:
     """Return the runs of a unit and its true arms, (3, 3) m, with the centroid as origin."""
     real = true_unit(seed, budget)
@@ -163,9 +138,10 @@ def case(seed: int, signs: tuple[int, ...], budget: Budget) -> tuple[list[Run], 
     for sign in signs:
         for pose in POSES:
             turn = scenario(seed, real, pose, sign, budget)
-            found = navigate_rotations(
-                partial(iter, [increments(turn)]),
-                np.eye(3),
+            found = navigate_capture(
+                partial(iter, [np.concatenate(list(simulated_pulses(turn)))]),
+                LAYOUT,
+                NOMINAL.without_size_effect(),
                 turn.site,
                 f"{pose}{sign:+d}",
                 NavigationOptions(priors=budget.priors),
@@ -178,43 +154,29 @@ def case(seed: int, signs: tuple[int, ...], budget: Budget) -> tuple[list[Run], 
     return runs, lever_arms_of(real, f"case {seed}").r_b
 
 
-class Tally:
-    """Errors and covariances of one method."""
-
-    def __init__(self, method: str) -> None:
-        self.method = method
-        self.errors: list[Array] = []
-        self.covariances: list[Array] = []
-        self.chi_square: list[float] = []
-
-    def add(self, estimate: LeverArmEstimate, truth: Array) -> None:
-        """Add an estimate and the true arms."""
-        self.errors.append((estimate.R_b - truth).ravel() / MM)
-        self.covariances.append(estimate.covariance / MM**2)
-        self.chi_square.append(estimate.chi_square / max(1, estimate.degrees_of_freedom))
-
-    def statistics(self) -> Statistics:
-        """Return the statistics of all cases."""
-        errors, covariances = np.array(self.errors), np.array(self.covariances)
-        n = len(errors)
-        rms = np.sqrt((errors**2).mean(axis=1))
-        six = errors @ TO_DIFFERENCES.T
-        inverse = np.linalg.inv(TO_DIFFERENCES @ covariances @ TO_DIFFERENCES.T)
-        scatter = float(np.sqrt((errors**2).mean()))
-        predicted = float(np.sqrt(np.trace(covariances, axis1=1, axis2=2).mean() / 9.0))
-        low, high = (float(chi2.ppf(p, 6 * n)) / n for p in (0.025, 0.975))
-        return Statistics(
-            self.method,
-            n,
-            float(rms.mean()),
-            float(rms.max()),
-            scatter,
-            predicted,
-            predicted / scatter,
-            float(np.einsum("ni,nij,nj->n", six, inverse, six).mean()),
-            (low, high),
-            float(np.mean(self.chi_square)),
-        )
+def statistics(method: str, found: Sequence[tuple[LeverArmEstimate, Array]]) -> Statistics:
+    """Return the statistics of a method from its estimates, each with the true arms."""
+    errors = np.array([(estimate.R_b - truth).ravel() / MM for estimate, truth in found])
+    covariances = np.array([estimate.covariance / MM**2 for estimate, _ in found])
+    n = len(errors)
+    rms = np.sqrt((errors**2).mean(axis=1))
+    six = errors @ TO_DIFFERENCES.T
+    inverse = np.linalg.inv(TO_DIFFERENCES @ covariances @ TO_DIFFERENCES.T)
+    scatter = float(np.sqrt((errors**2).mean()))
+    predicted = float(np.sqrt(np.trace(covariances, axis1=1, axis2=2).mean() / 9.0))
+    low, high = (float(chi2.ppf(p, 6 * n)) / n for p in (0.025, 0.975))
+    return Statistics(
+        method,
+        cases=n,
+        mean_rms_mm=float(rms.mean()),
+        worst_rms_mm=float(rms.max()),
+        scatter_mm=scatter,
+        predicted_mm=predicted,
+        ratio=predicted / scatter,
+        nees=float(np.einsum("ni,nij,nj->n", six, inverse, six).mean()),
+        nees_band=(low, high),
+        chi_square_per_degree=float(np.mean([e.chi_square / max(1, e.degrees_of_freedom) for e, _ in found])),
+    )
 
 
 def run_cases(seeds: Iterable[int], signs: tuple[int, ...], budget: Budget) -> list[Statistics]:
@@ -234,9 +196,9 @@ def run_cases(seeds: Iterable[int], signs: tuple[int, ...], budget: Budget) -> l
     list of Statistics
         Of `estimate_joint` and `estimate_plain`.
     """
-    tallies = Tally("joint"), Tally("plain")
+    joint, plain = [], []
     for seed in seeds:
         runs, truth = case(seed, signs, budget)
-        for tally, method in zip(tallies, (estimate_joint, estimate_plain), strict=True):
-            tally.add(method(runs, budget.priors), truth)
-    return [tally.statistics() for tally in tallies]
+        joint.append((estimate_joint(runs, budget.priors), truth))
+        plain.append((estimate_plain(runs, budget.priors), truth))
+    return [statistics("joint", joint), statistics("plain", plain)]

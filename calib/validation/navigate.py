@@ -35,12 +35,11 @@ from calib.estimation.runs import GUARD_S, Priors
 from calib.validation.skew import SkewCorrection
 from calib.validation.trial import BEFORE_S, FIRST_S, NavigatedVelocity, Trial, TrialSettings
 from imudrv.arrays import Array
+from imudrv.calibration import coefficients
 from imudrv.errors import InputError
 from imudrv.imu.coefficients import Coefficients
 from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import rate_filter
 from imudrv.nav.alignment import Aligned, Alignment
-from imudrv.nav.earth import normal_gravity
 from imudrv.nav.mechanisation import Navigator
 from imudrv.records import Records
 from imudrv.units import NS
@@ -71,9 +70,9 @@ def navigate(
     InputError
         The first rest is too short for the alignment, or none follows the motion.
     """
-    known = settings.coefficients()
-    normal = _NavigationChain(settings, replace(known, r_b=None))
-    compensated = _NavigationChain(settings, known)
+    bare = coefficients(settings.calibration.without_size_effect())
+    normal = _NavigationChain(settings, bare)
+    compensated = _NavigationChain(settings, settings.coefficients())
 
     def uncompensated() -> Iterator[Records]:
         for piece in pulses:
@@ -86,17 +85,16 @@ def navigate(
     moved_s = _motion(name, segments, settings.align_s)
     v_n = normal.v_n(), compensated.v_n()
     n = min(map(len, v_n))
-    site = settings.site
     return Trial(
         name,
         t_s=BLOCK_NS * NS * (np.arange(n, dtype=np.float64) + 0.5),
         normal=NavigatedVelocity(normal.aligned(), v_n[0][:n]),
         compensated=NavigatedVelocity(compensated.aligned(), v_n[1][:n]),
-        twin=None if twin is None else _navigate_twin(settings, known, twin, n),
+        twin=None if twin is None else _navigate_twin(settings, bare, twin, n),
         moved_s=moved_s,
         peak_deg_per_s=max((rotation.peak_deg_per_s for rotation in segments.rotations), default=0.0),
         noise=pooled_noise(rest.differences for rest in segments.rests),
-        gravity=site.gravity_m_s2 or normal_gravity(site.latitude_rad, site.height_m),
+        gravity=settings.site.gravity,
     )
 
 
@@ -118,9 +116,9 @@ def _motion(name: str, segments: Segments, align_s: float) -> tuple[float, float
 
 
 def _navigate_twin(
-    settings: TrialSettings, known: Coefficients, pulses: Iterable[Records], n: int
+    settings: TrialSettings, bare: Coefficients, pulses: Iterable[Records], n: int
 ) -> NavigatedVelocity:
-    chain = _NavigationChain(replace(settings, skew_s=0.0), replace(known, r_b=None))
+    chain = _NavigationChain(replace(settings, skew_s=0.0), bare)
     for piece in pulses:
         chain.feed(piece)
     chain.close()
@@ -133,8 +131,8 @@ class _NavigationChain:
     def __init__(self, settings: TrialSettings, known: Coefficients) -> None:
         site, layout = settings.site, settings.layout
         self._site = site
-        self._compensator = Compensator(known, layout, rate_filter(settings.rate_filter, layout.interval_ns))
-        self._skew = SkewCorrection(settings, known) if settings.skew_s else None
+        self._compensator = Compensator(known, layout, settings.rate_filter)
+        self._skew = SkewCorrection(settings) if settings.skew_s else None
         priors = Priors()
         self._alignment = Alignment(
             site.latitude_rad, priors.gyro_bias, priors.accelerometer_bias, settings.align_s
@@ -173,14 +171,7 @@ class _NavigationChain:
             increments = self._alignment.feed(increments)
             if not self._alignment.done:
                 return
-            site = self._site
-            self._navigator = Navigator(
-                site.latitude_rad,
-                site.longitude_rad,
-                site.height_m,
-                site.gravity_m_s2,
-                self._alignment.result().q_nb,
-            )
+            self._navigator = Navigator(self._site.place, self._alignment.result().q_nb)
         v_n = np.concatenate([self._remainder, self._navigator.feed(increments)["v_n"]])
         whole = len(v_n) - len(v_n) % self._samples
         self._means.append(v_n[:whole].reshape(-1, self._samples, 3).mean(axis=1))

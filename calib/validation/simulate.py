@@ -16,15 +16,13 @@ from calib.certificate import PROVENANCE_IDENTIFIED, with_lever_arms
 from calib.detection.acceptance import RotationLimits
 from calib.estimation.joint import estimate_joint
 from calib.estimation.result import LeverArmEstimate
-from calib.estimation.runs import NavigationOptions, Run, navigate_rotations
-from calib.lever_arms.gauge import LeverArms
+from calib.estimation.runs import NavigationOptions, Run, navigate_capture
 from calib.validation.navigate import navigate
 from calib.validation.trial import RATE_FILTER, Trial, TrialSettings
 from imudrv import profiles
 from imudrv.arrays import Array
-from imudrv.calibration import Accelerometer, Calibration, Gyro, SensingPoints, SizeEffect, coefficients
-from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import RateFilterName, rate_filter
+from imudrv.calibration import Accelerometer, Calibration, Gyro
+from imudrv.imu.rate_filter import RateFilterName
 from imudrv.nav.alignment import ALIGNMENT_S
 from imudrv.records import Flag, Records
 from imudrv.sim import scenario as scenarios
@@ -32,7 +30,8 @@ from imudrv.sim.scenario import NOMINAL, Residuals, Rest, Scenario, Segment, Uni
 from imudrv.sim.unit import draw_true_unit, simulate
 from imudrv.units import ARCSEC, DEG_PER_H, UG
 
-PROFILE: Final = "imu50-rs422"
+LAYOUT: Final = profiles.load("imu50-rs422").layout()
+"""Layout of the simulated units."""
 
 
 PROCEDURE: Final = ("z-up", "x-up", "y-up")
@@ -62,14 +61,16 @@ class SimulatedUnit:
         Known calibration: the nominal one with the identified lever arms.
     result : LeverArmEstimate
         The estimate.
-    skew_s : float
-        Estimated skew of the accelerometer samples, s.
     """
 
     real: Calibration
     found: Calibration
     result: LeverArmEstimate
-    skew_s: float
+
+    @property
+    def skew_s(self) -> float:
+        """Estimated skew of the accelerometer samples, s."""
+        return next(n.value for n in self.result.parameters if n.name == "skew_s")
 
 
 def subject(unit: Unit, seed: int, *, procedure: Sequence[str] = PROCEDURE) -> SimulatedUnit:
@@ -88,27 +89,23 @@ def subject(unit: Unit, seed: int, *, procedure: Sequence[str] = PROCEDURE) -> S
     -------
     SimulatedUnit
     """
-    nominal = (unit.calibration or NOMINAL).model_copy(update={"size_effect": None})
+    nominal = (unit.calibration or NOMINAL).without_size_effect()
     real = true_calibration(unit, seed)
     built = unit.model_copy(update={"calibration": real, "residuals": Residuals()})
     runs = [
         run for k, name in enumerate(procedure) for run in _simulated_runs(name, built, [seed, k], nominal)
     ]
     result = estimate_joint(runs)
-    skew_s = next(n.value for n in result.parameters if n.name == "skew_s")
-    arms = LeverArms(result.R_b, result.covariance, result.gauge)
-    return SimulatedUnit(
-        real,
-        with_lever_arms(nominal, arms, PROVENANCE_IDENTIFIED, {"method": result.method}),
-        result,
-        skew_s,
-    )
+    found = with_lever_arms(nominal, result.arms, PROVENANCE_IDENTIFIED, {"method": result.method})
+    return SimulatedUnit(real, found, result)
 
 
 def true_calibration(unit: Unit, seed: int) -> Calibration:
     """Return the calibration of the unit that a seed draws, which would leave no error."""
     nominal = unit.calibration or NOMINAL
-    drawn = draw_true_unit(scenarios.load(PROCEDURE[0]).model_copy(update={"unit": unit, "seed": seed}))
+    drawn = draw_true_unit(
+        scenarios.load(PROCEDURE[0]).model_copy(update={"unit": unit, "seed": seed}), LAYOUT
+    )
     return nominal.model_copy(
         update={
             "gyro": Gyro(
@@ -183,11 +180,8 @@ def trial(
     """
     unit = of.unit.model_copy(update={"calibration": who.real, "residuals": Residuals()})
     run = of.model_copy(update={"seed": _seed([seed, len(PROCEDURE)]), "unit": unit})
-    layout = profiles.load(PROFILE).layout()
-    settings = TrialSettings(layout, who.found, run.site, align_s, filter_name, skew_s)
-    return navigate(
-        label, _pulses(run, layout.interval_ns), settings, _pulses(_twin(run), layout.interval_ns)
-    )
+    settings = TrialSettings(LAYOUT, who.found, run.site, align_s, filter_name, skew_s)
+    return navigate(label, simulated_pulses(run), settings, simulated_pulses(_twin(run)))
 
 
 def campaign(
@@ -268,16 +262,9 @@ def dither_trials(seed: int) -> Iterator[Trial]:
 
 def _twin(run: Scenario) -> Scenario:
     """Return the same run with accelerometers at the origin and in time, increments without dither."""
-    calibration = run.unit.calibration or NOMINAL
-    none = (0.0, 0.0, 0.0)
-    points = SizeEffect(r_mm=SensingPoints(x=none, y=none, z=none), gauge="centroid")
-    unit = _with_dither(run.unit, 0.0).model_copy(
-        update={
-            "calibration": calibration.model_copy(update={"size_effect": points}),
-            "accelerometer_skew_s": 0.0,
-        }
-    )
-    return run.model_copy(update={"unit": unit})
+    calibration = (run.unit.calibration or NOMINAL).without_size_effect()
+    changes = {"calibration": calibration, "accelerometer_skew_s": 0.0}
+    return run.model_copy(update={"unit": _with_dither(run.unit, 0.0).model_copy(update=changes)})
 
 
 def _with_dither(unit: Unit, share: float) -> Unit:
@@ -294,18 +281,10 @@ ANY_MOTION: Final = RotationLimits(
 
 def _simulated_runs(name: str, unit: Unit, seed: list[int], known: Calibration) -> tuple[Run, ...]:
     """Return the runs of one simulated capture of the procedure."""
-    layout = profiles.load(PROFILE).layout()
     run = scenarios.load(name).model_copy(update={"unit": unit, "seed": _seed(seed)})
-    bare = coefficients(known)
-    limits = RotationLimits() if name in PROCEDURE else ANY_MOTION
-
-    def increments() -> Iterator[Records]:
-        compensator = Compensator(bare, layout, rate_filter("causal", layout.interval_ns))
-        for pulses in captured:
-            yield compensator.feed(pulses)
-
-    captured = list(_pulses(run, layout.interval_ns))
-    return navigate_rotations(increments, bare.C_ba, run.site, name, NavigationOptions(limits)).runs
+    options = NavigationOptions(RotationLimits() if name in PROCEDURE else ANY_MOTION)
+    pulses = list(simulated_pulses(run))
+    return navigate_capture(lambda: pulses, LAYOUT, known, run.site, name, options).runs
 
 
 def _rows(matrix: Array) -> Any:
@@ -313,8 +292,9 @@ def _rows(matrix: Array) -> Any:
     return tuple(map(tuple, matrix.tolist()))
 
 
-def _pulses(run: Scenario, interval_ns: int) -> Iterator[Records]:
-    for chunk in simulate(run, interval_ns):
+def simulated_pulses(run: Scenario) -> Iterator[Records]:
+    """Yield the pulses of a scenario, piece by piece."""
+    for chunk in simulate(run, LAYOUT):
         chunk.pulses["flags"] = Flag.VALID
         yield chunk.pulses
 

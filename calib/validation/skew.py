@@ -1,15 +1,13 @@
 """Correction of a gyro-accelerometer skew by interpolation."""
 
-from dataclasses import replace
 from math import floor
 
 import numpy as np
 
 from calib.validation.trial import TrialSettings
+from imudrv.calibration import coefficients
 from imudrv.errors import InputError
-from imudrv.imu.coefficients import Coefficients
 from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import rate_filter
 from imudrv.records import Flag, Records
 from imudrv.units import NS
 
@@ -21,12 +19,11 @@ class SkewCorrection:
     nearest samples (Lagrange). The size effect is computed at the time of the gyros and is not shifted.
     """
 
-    def __init__(self, settings: TrialSettings, known: Coefficients) -> None:
+    def __init__(self, settings: TrialSettings) -> None:
         layout = settings.layout
         self._interval_ns = layout.interval_ns
-        self._bare = Compensator(
-            replace(known, r_b=None), layout, rate_filter(settings.rate_filter, layout.interval_ns)
-        )
+        bare = coefficients(settings.calibration.without_size_effect())
+        self._bare = Compensator(bare, layout, settings.rate_filter)
         at = -settings.skew_s / (layout.interval_ns * NS)
         first = floor(at)
         u = at - first

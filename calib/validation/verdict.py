@@ -6,9 +6,11 @@ from typing import Final
 import numpy as np
 
 from calib.detection.noise import Noise
-from calib.validation.trial import FIRST_S, Expected, Trial
+from calib.html_table import html_table
+from calib.validation.trial import FIRST_S, Trial
 from imudrv.arrays import Array
 from imudrv.nav.earth import SEMI_MAJOR_AXIS
+from imudrv.units import MM
 
 MIN_REDUCTION: Final = 0.95
 """Required reduction of the velocity after a fast motion, as a fraction."""
@@ -18,14 +20,14 @@ MAX_CHANGE: Final = 0.05
 """Largest change of the velocity without fast rotation, as a fraction."""
 
 
-@dataclass(frozen=True)
-class TrialMetrics:
+@dataclass(frozen=True, repr=False)
+class Validation:
     """Metrics of a trial, m/s; of the horizontal velocity unless stated.
 
     Attributes
     ----------
-    expected : {'reduced', 'unchanged'}
-        Required effect of compensation.
+    trial : Trial
+        The velocities.
     before : tuple of 2 float
         rms in the rest before the motion, without and with compensation; NaN without such a rest.
     first : tuple of 3 float
@@ -43,7 +45,7 @@ class TrialMetrics:
         rms velocity that the sensor noise causes over that rest.
     """
 
-    expected: Expected
+    trial: Trial
     before: tuple[float, float]
     first: tuple[float, float, float]
     first_n: Array
@@ -51,6 +53,24 @@ class TrialMetrics:
     effect: tuple[float, float]
     change: float
     noise: float
+
+    def __repr__(self) -> str:
+        return f"<Validation: {self._summary}>"
+
+    def _repr_html_(self) -> str:
+        head = ("horizontal velocity, mm/s", "not compensated", "compensated")
+        rows = [("first second after the motion", self.first), ("whole rest, rms", self.whole)]
+        return html_table(
+            self._summary, head, [(name, *(f"{v / MM:.2f}" for v in pair[:2])) for name, pair in rows]
+        )
+
+    @property
+    def _summary(self) -> str:
+        without, compensated = (v / MM for v in self.first[:2])
+        return (
+            f"{self.trial.name}: {'good' if self.good else 'bad'}; velocity after the motion "
+            f"{without:.2f} mm/s, compensated {compensated:.2f} mm/s"
+        )
 
     @property
     def reduction(self) -> float:
@@ -60,12 +80,12 @@ class TrialMetrics:
     @property
     def good(self) -> bool:
         """Whether compensation has the required effect."""
-        if self.expected == "reduced":
+        if self.trial.expected == "reduced":
             return self.reduction >= MIN_REDUCTION
         return self.change < min(MAX_CHANGE * self.whole[0], self.noise)
 
 
-def evaluate(trial: Trial) -> TrialMetrics:
+def evaluate(trial: Trial) -> Validation:
     """Compute the metrics of a trial.
 
     Parameters
@@ -75,7 +95,7 @@ def evaluate(trial: Trial) -> TrialMetrics:
 
     Returns
     -------
-    TrialMetrics
+    Validation
     """
     after, before = trial.after, trial.before
     first = after & (trial.t_s < trial.t_s[after][0] + FIRST_S)
@@ -83,8 +103,8 @@ def evaluate(trial: Trial) -> TrialMetrics:
     twin_v = np.full_like(v[0], np.nan) if trial.twin is None else trial.twin.v_n
     mean = [one[first].mean(axis=0) for one in (*v, twin_v)]
     noise = noise_velocity(trial.t_s[after], trial.noise, trial.gravity)
-    return TrialMetrics(
-        trial.expected,
+    return Validation(
+        trial,
         before=(_rms(v[0][before]), _rms(v[1][before])) if before.any() else (np.nan, np.nan),
         first=(_speed(mean[0]), _speed(mean[1]), _speed(mean[2])),
         first_n=np.array(mean[:2]),

@@ -19,6 +19,7 @@ COMMANDS: Final = {
     "export": "Convert a recording to another format.",
     "pack": "Compress a recording.",
     "sim": "Simulate a unit: to a capture, or live on a port.",
+    "profiles": "List the shipped profiles, print one, or begin one from a DBC file.",
     "check": "Check a calibration, site, profile, scenario or settings file.",
 }
 

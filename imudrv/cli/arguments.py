@@ -11,7 +11,7 @@ from imudrv.files.outputs import is_standard_output
 
 def add_profile(parser: argparse.ArgumentParser, required: bool = False) -> None:
     """Add ``--profile``."""
-    text = f"wire format: {', '.join(profiles.shipped())}, or a profile file"
+    text = f"wire format: {', '.join(profiles.OWN)}, another one of `imudrv profiles`, or a profile file"
     parser.add_argument("--profile", required=required, metavar="P", help=text)
 
 

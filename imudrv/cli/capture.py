@@ -1,36 +1,62 @@
 """The capture that `decode` and `compensate` read, and the summary of its losses."""
 
 import argparse
+import sys
 from pathlib import Path
 
-from imudrv import profiles
 from imudrv.capture import Capture
 from imudrv.cli.arguments import add_profile, message_stream
+from imudrv.terminal import BAD_INPUT, OK
+from imudrv.wire.layout import Layout, SequenceKind
 
 
 def add_capture(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that `open_capture` takes."""
-    text = "wire bytes, a candump log, or a recording (.mcap), which contains its profile"
+    text = "wire bytes, a CAN log (candump, .asc, .blf, .trc, ..), also .gz or .zst; or a recording (.mcap)"
     parser.add_argument("capture", type=Path, help=text)
     add_profile(parser)
-    parser.add_argument("--channel", metavar="NAME", help="CAN channel of a candump log, such as can0")
+    parser.add_argument("--channel", metavar="NAME", help="channel of a CAN log, such as can0")
 
 
 def open_capture(arguments: argparse.Namespace) -> Capture:
     """Open the capture that the arguments name."""
-    profile = profiles.load(arguments.profile) if arguments.profile else None
-    return Capture(arguments.capture, profile, arguments.channel)
+    return Capture(arguments.capture, arguments.profile, arguments.channel)
 
 
-def print_losses(capture: Capture, output: Path) -> None:
-    """Print what was read, and which samples and bytes were lost or rejected."""
+def print_losses(capture: Capture, output: Path) -> int:
+    """Print what was read, and which samples and bytes were lost or rejected; return the exit code."""
     stream = message_stream(output)
-    print(f"{capture.path}: {capture.layout.name}, {capture.size} bytes -> {output}", file=stream)
-    print(f"  {capture.tracker.counts}", file=stream)
+    file = capture.file
+    what = f" of {file.description}" if file.is_converted or file.archive else ""
+    print(f"{capture.path}: {capture.layout.name}, {capture.size} bytes{what} -> {output}", file=stream)
+    if capture.is_profile_found:
+        print(f"  profile {capture.layout.name}: found, for it fits best of the shipped ones", file=stream)
+    counts = capture.tracker.counts
+    print(f"  {counts}", file=stream)
+    if counts.unknown_gaps:
+        print(f"  {_unknown_gaps(counts.unknown_gaps, capture.layout)}", file=stream)
     for reason, rejected in sorted(capture.rejected.items()):
         name = reason.name.lower().replace("_", " ")
         first = ", ".join(map(str, rejected.first))
         more = ", ..." if rejected.runs > len(rejected.first) else ""
-        print(f"  {name}: {rejected.runs} x, {rejected.length} in all, at {first}{more}", file=stream)
+        where = "" if file.is_converted else f", at {first}{more}"
+        print(f"  {name}: {rejected.runs} x, {rejected.length} in all{where}", file=stream)
     for channel, messages in list(capture.channels.items())[1:]:
         print(f"  ignored: {messages} messages of channel {channel}", file=stream)
+    for hint in capture.hints:
+        print(f"  hint: {hint}", file=stream)
+    if fault := capture.sequence_fault:
+        print(f"error: {capture.path}: {fault}", file=sys.stderr)
+        return BAD_INPUT
+    return OK
+
+
+def _unknown_gaps(count: int, layout: Layout) -> str:
+    """Say how long the gaps may be whose length neither a counter nor a time of arrival tells."""
+    gaps = "1 gap of unknown length" if count == 1 else f"{count} gaps of unknown length"
+    if layout.sequence.kind is SequenceKind.NONE:
+        return f"{gaps}: the unit sends no counter, and the capture has no times of arrival"
+    return (
+        f"{gaps}, counted with the smallest: or {float(layout.samples_a_round):g} samples more, "
+        "any number of times, for the capture has no times of arrival"
+    )

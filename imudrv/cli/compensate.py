@@ -11,7 +11,7 @@ from imudrv.errors import InputError
 from imudrv.files.outputs import require_other
 from imudrv.files.tables import increment_columns, table
 from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import NAMES, rate_filter
+from imudrv.imu.rate_filter import NAMES
 from imudrv.terminal import progress
 
 EXAMPLE: Final = "z-up.raw --profile imu50-rs422 --calibration unit.yaml -o increments.npz"
@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_output(parser, "NAME.csv, NAME.npz or NAME.i50n; - for csv on standard output")
 
 
-def run(arguments: argparse.Namespace) -> None:
+def run(arguments: argparse.Namespace) -> int:
     """Write the compensated increments of a capture as a table."""
     require_other(arguments.output, arguments.capture, arguments.profile, arguments.calibration)
     capture = open_capture(arguments)
@@ -41,21 +41,23 @@ def run(arguments: argparse.Namespace) -> None:
         calibration, origin = recorded, "calibration of the recording"
     else:
         raise InputError("expected --calibration: only a recording of the service contains a calibration")
-    layout, filter_name = capture.layout, arguments.rate_filter
-    compensator = Compensator(coefficients(calibration), layout, rate_filter(filter_name, layout.interval_ns))
+    compensator = Compensator(coefficients(calibration), capture.layout, arguments.rate_filter)
     with (
         table(arguments.output, (".csv", ".npz", ".i50n"), {}) as rows,
         progress("compensate", capture.size) as advance,
     ):
         for increments in capture.increments(compensator, advance):
             rows.write(increment_columns(increments))
-    print_losses(capture, arguments.output)
+    code = print_losses(capture, arguments.output)
     stream = message_stream(arguments.output)
-    size_effect = (
-        "compensated" if calibration.size_effect else "not compensated: the calibration has no sensing points"
-    )
+    size_effect = "compensated"
+    if not calibration.size_effect:
+        size_effect = "not compensated: the calibration has no sensing points"
+    elif not compensator.has_size_effect:
+        size_effect = f"not compensated: {capture.layout.name} lacks axes"
     print(f"  unit {calibration.serial_number}, {origin}", file=stream)
     print(
-        f"  size effect {size_effect}; rate filter {filter_name}, delay {compensator.lag} samples",
+        f"  size effect {size_effect}; rate filter {arguments.rate_filter}, delay {compensator.lag} samples",
         file=stream,
     )
+    return code

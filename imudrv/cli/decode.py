@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_output(parser, "NAME.csv or NAME.npz; - for csv on standard output")
 
 
-def run(arguments: argparse.Namespace) -> None:
+def run(arguments: argparse.Namespace) -> int:
     """Write the pulse increments of a capture as a table."""
     require_other(arguments.output, arguments.capture, arguments.profile)
     capture = open_capture(arguments)
@@ -29,4 +29,4 @@ def run(arguments: argparse.Namespace) -> None:
     ):
         for pulses in capture.pulses(advance):
             rows.write(pulse_columns(pulses, capture.layout))
-    print_losses(capture, arguments.output)
+    return print_losses(capture, arguments.output)

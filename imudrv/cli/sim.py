@@ -14,8 +14,9 @@ from imudrv.files.tables import table, writing
 from imudrv.service.printer import Printer
 from imudrv.sim import scenario as scenarios
 from imudrv.sim.capture import record
-from imudrv.sim.live import play, speed_of
+from imudrv.sim.live import play
 from imudrv.terminal import progress
+from imudrv.url import speed_of
 
 EXAMPLE: Final = "rocking --profile imu50-rs422 --port pty --link /tmp/imu50"
 
@@ -48,7 +49,7 @@ def _record(arguments: argparse.Namespace) -> None:
         raise InputError("--speed, --link: expected with --port; a capture has no speed")
     layout = profiles.load(arguments.profile).layout()
     scenario = scenarios.load(arguments.scenario)
-    samples = scenarios.samples(scenario, layout.interval_ns)
+    samples = scenarios.samples(scenario, layout.interval)
     if arguments.truth is not None and arguments.truth.suffix != ".npz":
         raise InputError(f"--truth {arguments.truth}: expected a name ending in .npz")
     for output in filter(None, (arguments.output, arguments.truth)):

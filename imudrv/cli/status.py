@@ -2,6 +2,7 @@
 
 import argparse
 import json
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -19,8 +20,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Print the status of a service; return the exit code of its health."""
     status = ask(arguments.status or default_status_path())
-    if arguments.json:
-        print(json.dumps(status, indent=1))
-    else:
-        print("\n".join([status["health"], *status["reasons"]]))
+    text = (
+        json.dumps(status, indent=1) if arguments.json else "\n".join([status["health"], *status["reasons"]])
+    )
+    with suppress(BrokenPipeError):  # the health is the same whether or not all of it is read
+        print(text)
     return EXIT_CODES[status["health"]]

@@ -5,12 +5,12 @@ import math
 import os
 import resource
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from imudrv.doctor.verdict import Finding, Verdict
+from imudrv.ports.holders import holders
 from imudrv.service.runtime import PRIORITY
 
 RULES: Final = "tools/99-imu50.rules"
@@ -77,7 +77,7 @@ def device_steps(device: Path, system: System) -> Iterator[Finding]:
         yield Finding("permission", Verdict.FAIL, found, fix)
         return
     yield Finding("permission", Verdict.OK, "this user can open it")
-    users, all_inspected = holders(target, system)
+    users, all_inspected = holders(target, system.proc)
     if users:
         found = f"open in {', '.join(users)}: each program would receive only a part of the bytes"
         yield Finding("busy", Verdict.FAIL, found, "stop that program")
@@ -92,28 +92,6 @@ def candidates(system: System) -> list[Path]:
     taken = {path.resolve() for path in named}
     plain = sorted(path for kind in ("ttyUSB*", "ttyACM*") for path in system.dev.glob(kind))
     return named + [path for path in plain if path.resolve() not in taken]
-
-
-def holders(device: Path, system: System) -> tuple[list[str], bool]:
-    """Return the other processes that have a device open, and whether all could be inspected."""
-    found = []
-    all_inspected = True
-    for process in system.proc.glob("[0-9]*"):
-        if process.name == str(os.getpid()):
-            continue
-        try:
-            links = [os.readlink(fd) for fd in (process / "fd").iterdir()]
-        except PermissionError:
-            all_inspected = False
-            continue
-        except OSError:
-            continue  # it has ended
-        if str(device) in links:
-            name = "?"
-            with suppress(OSError):
-                name = (process / "comm").read_text().strip()
-            found.append(f"{name} (process {process.name})")
-    return found, all_inspected
 
 
 def _group(device: Path) -> str:

@@ -1,26 +1,25 @@
 """Examination of a port, its data and the system, step by step, with a fix for each fault."""
 
-import os
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final
 from urllib.parse import urlencode
 
 import numpy as np
 
 from imudrv import diagnosis, profiles
+from imudrv.diagnosis import Mismatch
 from imudrv.doctor.device import System, device_steps, interface_step, limits, usb
-from imudrv.doctor.traffic import check_line_load, check_traffic, mismatch
+from imudrv.doctor.traffic import check_line_errors, check_line_load, check_mismatch, check_traffic
 from imudrv.doctor.verdict import Finding, Verdict
 from imudrv.errors import InputError
 from imudrv.files import settings_file
 from imudrv.ports import Port, PortEndedError, PortLostError, open_port
-from imudrv.ports.url import Url, split, value
 from imudrv.profiles.schema import CanLine, Profile, SerialLine
 from imudrv.records import MESSAGE, Records, Source
 from imudrv.units import NS
+from imudrv.url import Url, split, value
 
 BAUDRATES: Final = (460_800, 921_600, 115_200, 230_400, 1_000_000, 2_000_000, 3_000_000, 57_600, 38_400)
 """Tried in this order if the data fits no profile at the expected baud rate."""
@@ -92,16 +91,12 @@ class _Target:
     system: System
 
     @property
-    def device(self) -> Path | None:
-        """Device file of a serial port."""
-        return Path(self.url.address) if self.url.scheme == "serial" and os.name == "posix" else None
-
-    @property
     def has_line_settings(self) -> bool:
         """Whether the port has settings that can be wrong; a pty and a network have none."""
         if self.url.scheme in ("can", "hwgrep", "rfc2217"):
             return True
-        return self.device is not None and not self.device.resolve().is_relative_to("/dev/pts")
+        device = self.url.device
+        return device is not None and not device.resolve().is_relative_to("/dev/pts")
 
     def shipped(self, line: SerialLine | CanLine) -> list[Profile]:
         """Return the shipped profiles for this kind of line, with its settings if the port has any."""
@@ -147,7 +142,7 @@ def examine(
 def _default_profile(parts: Url) -> Profile:
     """Return a profile whose line settings are tried first if the user names none."""
     transport = "can" if parts.scheme == "can" else "serial"
-    return next(p for p in map(profiles.load, profiles.shipped()) if p.transport == transport)
+    return next(p for p in map(profiles.load, profiles.OWN) if p.transport == transport)
 
 
 def _with_line_of(parts: Url, profile: Profile) -> Profile:
@@ -159,8 +154,8 @@ def _with_line_of(parts: Url, profile: Profile) -> Profile:
 
 
 def _before_opening(target: _Target) -> Iterator[Finding]:
-    if target.device is not None:
-        yield from device_steps(target.device, target.system)
+    if target.url.device is not None:
+        yield from device_steps(target.url.device, target.system)
     elif target.url.scheme == "can" and target.url.address.startswith("socketcan/"):
         yield interface_step(target.url.address.removeprefix("socketcan/"), target.system)
 
@@ -173,14 +168,18 @@ def _on_the_port(target: _Target, listen_s: float) -> Iterator[Finding]:
         return
     try:
         yield Finding("open", Verdict.OK, target.url.text)
-        if target.device is not None:
-            yield from usb(target.device.resolve().name, target.system)
+        if target.url.device is not None:
+            yield from usb(target.url.device.resolve().name, target.system)
+        before = port.line_errors()
         data, span_s, trouble = _listen(port, target.profile.transport, listen_s)
+        errors = port.line_errors().since(before)
     finally:
         port.close()
     if trouble:
         yield Finding("data", Verdict.FAIL, trouble, "check plug, cable and adapter")
         return
+    if any(errors):
+        yield check_line_errors(errors)
     profile = target.profile
     if not target.is_given and len(data):
         profile = diagnosis.best_profile(target.shipped(profile.line), data) or profile
@@ -195,7 +194,7 @@ def _on_the_port(target: _Target, listen_s: float) -> Iterator[Finding]:
     may_fit = len(data) or profile.transport == "can"
     fitting = _fitting_profile(target, data) if may_fit else None
     if len(data) or fitting is not None:
-        yield mismatch(profile, traffic, fitting, target.is_given)
+        yield check_mismatch(Mismatch(profile, traffic, fitting), target.is_given)
     else:
         found = f"silence: nothing received in {listen_s:g} s"
         yield Finding("data", Verdict.FAIL, found, _SILENCE_FIX[profile.transport])
@@ -212,7 +211,7 @@ def _listen(port: Port, transport: str, seconds: float) -> tuple[bytes | Records
             port.read(_DISCARD_S)  # what the system has buffered says nothing about the rate
         begin_s = time.monotonic()
         while (left := begin_s + seconds - time.monotonic()) > 0 and amount < _MAX_AMOUNT:
-            t_ns, data = port.read(left)
+            t_ns, data, _ = port.read(left)
             if len(data):
                 first_ns = first_ns or t_ns
                 last_ns = t_ns

@@ -4,10 +4,10 @@ from collections.abc import Iterator
 from typing import Final
 
 from imudrv import diagnosis, profiles
-from imudrv.diagnosis import TrafficSummary
+from imudrv.diagnosis import Mismatch, TrafficSummary
 from imudrv.doctor.verdict import Finding, Verdict
+from imudrv.ports.base import LineErrors
 from imudrv.profiles.schema import Profile, SerialLine
-from imudrv.records import Reason
 
 _HEAVY_LOAD: Final = 0.9
 
@@ -17,7 +17,7 @@ def check_line_load(profile: Profile) -> Finding:
     load = diagnosis.line_load(profile)
     line = profile.line
     speed = f"{line.baudrate} baud" if isinstance(line, SerialLine) else f"{line.bitrate} bit/s"
-    found = f"{profile.name} at {profile.sample_rate_hz:g} Hz takes {100 * load:.1f} % of {speed}"
+    found = f"{profile.name} at {profile.rate_hz:g} Hz takes {100 * load:.1f} % of {speed}"
     if load > 1.0:
         return Finding("line load", Verdict.FAIL, found, "set the unit and the port to a higher line rate")
     if load > _HEAVY_LOAD:
@@ -56,8 +56,8 @@ def check_traffic(
         found = f"it jumped back {counts.restarts} times"
         yield Finding("counter", Verdict.WARN, found, "check the unit's power supply")
     rate_hz = diagnosis.rate(traffic, span_s)
-    if in_real_time and abs(rate_hz / profile.sample_rate_hz - 1.0) > diagnosis.RATE_TOLERANCE:
-        found = f"expected {profile.sample_rate_hz:g} samples/s, the unit counts {rate_hz:.0f}"
+    if in_real_time and abs(rate_hz / profile.rate_hz - 1.0) > diagnosis.RATE_TOLERANCE:
+        found = f"expected {profile.rate_hz:g} samples/s, the unit counts {rate_hz:.0f}"
         fix = "set sample_rate_hz in the profile, or the rate in the unit"
         yield Finding("rate", Verdict.FAIL, found, fix)
     bits = ", ".join(traffic.set_bits) or "no bit set"
@@ -73,17 +73,22 @@ def check_traffic(
         yield Finding("temperatures", Verdict.OK, ", ".join(degc))
 
 
-def mismatch(profile: Profile, traffic: TrafficSummary, fitting: Profile | None, is_given: bool) -> Finding:
+def check_line_errors(errors: LineErrors) -> Finding:
+    """Report errors that the driver of the line has counted."""
+    if errors.framing or errors.parity:
+        fix = "check baud rate, parity and stop bits on both sides, the ground, and the swap of A and B"
+        return Finding("line errors", Verdict.FAIL, str(errors), fix)
+    fix = "the machine is too slow for this line: use another USB socket or adapter, and `--realtime`"
+    return Finding("line errors", Verdict.WARN, str(errors), fix)
+
+
+def check_mismatch(mismatch: Mismatch, is_given: bool) -> Finding:
     """Report data that does not fit the expected profile.
 
     Parameters
     ----------
-    profile : Profile
-        The expected profile.
-    traffic : TrafficSummary
-        The data, decoded with it.
-    fitting : Profile or None
-        The profile that fits, with the line settings at which it does.
+    mismatch : Mismatch
+        What was found; the profile that fits has the line settings at which it does.
     is_given : bool
         Whether the user named the expected profile.
 
@@ -91,21 +96,18 @@ def mismatch(profile: Profile, traffic: TrafficSummary, fitting: Profile | None,
     -------
     Finding
     """
-    if profile.transport == "can":
-        found, at = f"{traffic.syncs} messages of {profile.name}, no complete sample", ""
-    else:
-        why = "no correct CRC" if Reason.CHECK_FAILED in traffic.rejected else "no complete frame"
-        found = f"{traffic.amount} bytes, sync {profile.messages[0].sync} found {traffic.syncs} times, {why}"
-        at = " at any usual baud rate"
+    profile, fitting = mismatch.profile, mismatch.fitting
+    is_serial = profile.transport == "serial"
+    amount = f"{mismatch.traffic.amount} {'bytes' if is_serial else 'messages'}"
+    found = f"{amount}, no frame of {profile.name}: {mismatch}"
     if fitting is None:
+        at = " at any usual baud rate" if is_serial else ""
         fix = "check the line settings against the unit's manual; for another wire format write a profile"
         return Finding("data", Verdict.FAIL, f"{found}; no shipped profile fits{at}", fix)
     fixes = [] if is_given and fitting.name == profile.name else [f"--profile {fitting.name}"]
-    at = ""
     if isinstance(fitting.line, SerialLine):
-        at = f" at {fitting.line.baudrate}"
+        found += f" at {fitting.line.baudrate}"
         usual = profiles.load(fitting.name).line
         if (isinstance(usual, SerialLine) and usual.baudrate != fitting.line.baudrate) or not fixes:
             fixes.append(f"?baudrate={fitting.line.baudrate} in the URL")
-    found = f"{found}: this looks like {fitting.name}{at}"
     return Finding("data", Verdict.FAIL, found, "use " + " and ".join(fixes))

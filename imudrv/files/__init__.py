@@ -1,6 +1,7 @@
 """Files: settings in YAML, tables, files that grow.
 
 settings_file  read, check and write settings
+shipped        files that come with the package, by name
 model          base of their models, shared types
 yaml_text      YAML within bounds
 faults         messages for faults of a settings file

@@ -78,12 +78,14 @@ def _open(path: str | os.PathLike[str]) -> Iterator[BufferedReader]:
             yield file
     except FileNotFoundError as error:
         raise InputError(f"{path}: expected a file, there is none; check the path") from error
-    except PermissionError as error:
-        raise InputError(
-            f"{path}: cannot be read: permission denied; change the permissions or the user"
-        ) from error
     except (OSError, ValueError) as error:  # ValueError: a NUL in the path
-        raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+        raise InputError(f"{path}: cannot be read: {_reason(error)}") from error
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, PermissionError):
+        return "permission denied; change the permissions or the user"
+    return getattr(error, "strerror", None) or str(error)
 
 
 def change_mark(path: str | os.PathLike[str]) -> tuple[int, int, int]:
@@ -160,11 +162,9 @@ def atomic_write(path: Path) -> Iterator[IO[bytes]]:
         temporary = None
         sync_folder(target.parent)
     except OSError as error:
-        reason = str(error.strerror or error)
+        reason = _reason(error)
         if not target.parent.is_dir():
             reason = f"expected the folder {path.parent}, there is none; make it first"
-        elif isinstance(error, PermissionError):
-            reason = "permission denied; change the permissions or the user"
         raise InputError(f"{path}: cannot be written: {reason}") from error
     finally:
         if temporary is not None:

@@ -2,7 +2,7 @@
 
 import difflib
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final, Literal, TypeAlias, get_args, get_origin
 
 from pydantic import ValidationError
@@ -38,6 +38,8 @@ _EXPECTED: Final = {
     "timezone_aware": f"{_TIME}, with its zone",
 }
 
+_NUMBER: Final = r"[-+]?(0x[0-9A-Fa-f]{1,16}|[0-9]{1,20}(\.[0-9]{1,20})?)"
+
 _Place: TypeAlias = tuple[str | int, ...]
 
 
@@ -59,8 +61,12 @@ def validation_faults(error: ValidationError, document: object, model: type[Mode
     found: dict[tuple[str, str], list[str]] = {}  # what was expected, by place and what came
     for place, e in _located(error.errors(include_url=False), document):
         where, name, came, values = _path(place), e["type"], e["input"], e.get("ctx", {})
+        keys = ".".join(step for step in place if isinstance(step, str))
         if name == "extra_forbidden":
-            found[where, _unknown_key(str(place[-1]), _keys(model, place[:-1]))] = []
+            known = _keys(model, place[:-1])
+            advice = model.advice_for_key(keys) or _nearest(str(place[-1]), known)
+            advice = advice or f"known are {', '.join(sorted(known))}"
+            found[where, f"unknown key; {advice}"] = []
         elif name == "missing" and isinstance(place[-1], int):
             # One error for each absent item of a tuple, in order: the last one gives the length.
             found[_path(place[:-1]), str(len(came))] = [f"{place[-1] + 1} {_plural(came)}"]
@@ -72,10 +78,11 @@ def validation_faults(error: ValidationError, document: object, model: type[Mode
             limit = "at least {min_length}" if name == "too_short" else "at most {max_length}"
             found[where, str(len(came))] = [f"{limit.format(**values)} {_plural(came)}"]
         elif name == "value_error":
-            found[where, str(values["error"])] = []
+            found |= {(where, fault): [] for fault in str(values["error"]).splitlines()}
         elif name in _EXPECTED:
-            quotes = "; put it in quotes" if name == "string_type" and isinstance(came, int | float) else ""
-            found.setdefault((where, shown_value(came) + quotes), []).append(_EXPECTED[name].format(**values))
+            advice = model.advice_for_value(keys, came) or _advice(name, came, values)
+            rest = shown_value(came) + (f"; {advice}" if advice else "")
+            found.setdefault((where, rest), []).append(_EXPECTED[name].format(**values))
         else:
             found[where, f"{e['msg']}, got {shown_value(came)}"] = []
     return [
@@ -136,9 +143,21 @@ def _keys(annotation: Any, place: _Place) -> set[str]:
     return set().union(*(_keys(argument, inside) for argument in get_args(annotation)))
 
 
-def _unknown_key(name: str, known: set[str]) -> str:
-    near = difflib.get_close_matches(name[:100], known, 1)
-    return "unknown key; " + (f"did you mean {near[0]}?" if near else f"known are {', '.join(sorted(known))}")
+def _advice(expected: str, came: object, values: Mapping[str, Any]) -> str:
+    """Return what to do with the quotes of a value, or the known value that is like this one."""
+    if expected == "string_type" and isinstance(came, int | float):
+        return "put it in quotes"
+    if expected in ("int_type", "float_type") and isinstance(came, str) and re.fullmatch(_NUMBER, came):
+        return "leave out the quotes"
+    if expected == "literal_error" and isinstance(came, str):
+        return _nearest(came, re.findall(r"'([^']*)'", values["expected"]))
+    return ""
+
+
+def _nearest(name: str, known: Iterable[str]) -> str:
+    """Return a hint at the known name that is like this one, if one is."""
+    near = difflib.get_close_matches(name[:100], list(known), 1)
+    return f"did you mean {near[0]}?" if near else ""
 
 
 def _path(place: _Place) -> str:

@@ -14,6 +14,21 @@ class Model(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
+    @classmethod
+    def current(cls, document: object) -> object:
+        """Return a document of an earlier version of the format in the words of this one."""
+        return document
+
+    @classmethod
+    def advice_for_key(cls, path: str) -> str:
+        """Return what to write in place of an unknown key, whose path is joined by dots; empty: not known."""
+        return ""
+
+    @classmethod
+    def advice_for_value(cls, path: str, value: object) -> str:
+        """Return what to write in place of a value that a key cannot have; empty: not known."""
+        return ""
+
 
 def _utc(time: datetime) -> datetime:
     if not 2000 <= time.year < 3000:

@@ -122,6 +122,7 @@ def parse(document: object, model: type[M], name: str) -> M:
     FaultyFileError
         It does not fit the model; all faults at once.
     """
+    document = model.current(document)
     if faults := list(header_faults(document, model)):
         raise FaultyFileError(name, faults)
     try:

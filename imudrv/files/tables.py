@@ -24,7 +24,8 @@ from imudrv.wire.layout import Layout
 
 Columns = Mapping[str, NDArray[np.generic]]
 
-_IN_RECORD: Final = {"dtheta": "dtheta_b", "dv": "dv_b"}
+_PULSES: Final = ("counter", "interval_ns", "gyro", "accelerometer", "temperature_degc", "status", "flags")
+_INCREMENTS: Final = ("counter", "interval_ns", "t_ns", "dtheta_b", "dv_b", "flags")
 _AXES: Final = ("x", "y", "z")
 _STANDARD_OUTPUT: Final = 1  # its file descriptor
 
@@ -44,15 +45,9 @@ def pulse_columns(pulses: Records, layout: Layout) -> Columns:
     mapping of str to ndarray
         One row a sample.
     """
-    return {
-        "counter": pulses["counter"],
-        "interval_ns": pulses["interval_ns"],
-        "gyro": pulses["gyro"],
-        "accelerometer": pulses["accelerometer"],
-        "temperature_degc": pulses["temperature_degc"][:, : len(layout.temperature_names)],
-        "status": pulses["status"],
-        "flags": pulses["flags"],
-    }
+    columns = {name: pulses[name] for name in _PULSES}
+    columns["temperature_degc"] = columns["temperature_degc"][:, : len(layout.temperature_names)]
+    return columns
 
 
 def increment_columns(increments: Records) -> Columns:
@@ -68,14 +63,7 @@ def increment_columns(increments: Records) -> Columns:
     mapping of str to ndarray
         One row a sample.
     """
-    return {
-        "counter": increments["counter"],
-        "interval_ns": increments["interval_ns"],
-        "t_ns": increments["t_ns"],
-        "dtheta": increments["dtheta_b"],
-        "dv": increments["dv_b"],
-        "flags": increments["flags"],
-    }
+    return {name.removesuffix("_b"): increments[name] for name in _INCREMENTS}
 
 
 class Table(Protocol):
@@ -118,7 +106,8 @@ class CsvTable:
         if not self._begun:
             self._begun = True
             self._file.write((",".join(names) + "\n").encode())
-        self._file.write("".join(",".join(map(repr, row)) + "\n" for row in zip(*flat, strict=True)).encode())
+        text = "".join(",".join(map(repr, row)) + "\n" for row in zip(*flat, strict=True))
+        self._file.write(text.replace("nan", "").encode())  # numbers only: NaN is an absent one
 
     def finish(self) -> None:
         """Do nothing: all rows are written."""
@@ -180,8 +169,8 @@ class DatagramTable:
     def write(self, columns: Columns) -> None:
         """Append increments."""
         increments = np.zeros(len(columns["counter"]), INCREMENTS)
-        for name, column in columns.items():
-            increments[_IN_RECORD.get(name, name)] = column
+        for name in _INCREMENTS:
+            increments[name] = columns[name.removesuffix("_b")]
         self._file.write(encode(increments, self._source))
 
     def finish(self) -> None:

@@ -108,7 +108,7 @@ def _value(event: Any, events: Iterator[Any], depth: int, faults: list[str]) -> 
     if event.tag is not None:
         faults.append(f"{line}: expected a value, got a tag (!); remove it, put text in quotes")
     if isinstance(event, yaml.ScalarEvent):
-        return _scalar(event.value) if event.implicit[0] else event.value
+        return scalar(event.value) if event.implicit[0] else event.value
     if depth == MAX_DEPTH:
         raise _UnusableError(f"{line}: expected at most {MAX_DEPTH} levels of nesting, got more")
     if isinstance(event, yaml.SequenceStartEvent):
@@ -128,7 +128,7 @@ def _until(end: type, events: Iterator[Any]) -> Iterator[Any]:
     return takewhile(lambda event: not isinstance(event, end), events)
 
 
-def _scalar(text: str) -> bool | float | str | None:
+def scalar(text: str) -> bool | float | str | None:
     """Return an unquoted value; integers of more than 20 digits become floats."""
     if text in _WORDS:
         return _WORDS[text]

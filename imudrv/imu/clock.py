@@ -5,9 +5,13 @@ arrival - elapsed shows the clock, and what is above it shows the host. With `el
 
     t = y_0 + (1 + skew) elapsed
 
-is the line under all arrivals of the last `window_s` that comes closest to them on average
+is the line under all arrivals of the last `WINDOW_NS` that comes closest to them on average
 (`imudrv.imu.envelope`). It changes at fixed counts only, and the stamps follow a new line by slewing; so any
 cut of the stream into pieces gives the same stamps, as does a replay of it.
+
+All this is on the scale of the arrivals, which never steps. Stamps are UNIX time: when the host's clock is
+set, they step with it, by the new offset of the `Timebase`, forward or back; the line stays as it is. After a
+suspend a new line begins, because the hardware clock that measured it may be wrong by a second.
 
 Where a timer delivers samples in bursts, the newest of a burst shows the clock. A timer that beats with the
 samples more slowly than once in the window hides up to one interval, which the arrivals cannot show.
@@ -18,26 +22,39 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from imudrv.imu.envelope import ENVELOPE, above, add_point, begin, close_bin, height, line_of, room_for_points
+from imudrv.imu.envelope import (
+    ENVELOPE,
+    MAX_SKEW,
+    above,
+    add_point,
+    begin,
+    close_bin,
+    height,
+    line_of,
+    room_for_points,
+)
 from imudrv.kernels import kernel
-from imudrv.records import Flag, Records
+from imudrv.records import Flag, Records, Timebase
 from imudrv.units import NS, NS_PER_S, PPM
 
+WINDOW_NS: Final = 90 * NS_PER_S
+"""Length of the window."""
 SLEW: Final = 200e-6
 """Largest change of a locked stamp towards a new line, as a fraction of the time since the last sample."""
 STALL_EDGES_S: Final = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
 """Limits between the bins of `ClockReport.stalls`."""
 
 _EARLY_NS: Final = 5_000_000  # no sample arrives so early: one of the clocks has stepped
-_CATCH_UP: Final = 0.5  # part of the time since the last sample by which a stamp ahead waits, while unlocked
+_WAIT: Final = 0.01  # part of an interval by which a stamp that is ahead moves on, while unlocked
 _LATEST_NS: Final = 2**62  # in the year 2116; keeps sums of whatever a recording holds within 64 bits
 _KEPT: Final = 1 << 16  # most stamps that wait for `stamp`, beside those of the last piece
 _ROOM: Final = 1 << 12
 _EDGES_NS: Final = tuple(round(edge * NS_PER_S) for edge in STALL_EDGES_S)
 _UNLOCKED: Final = int(Flag.CLOCK_UNLOCKED)
+_STEPPED: Final = int(Flag.CLOCK_STEPPED)
 
 CONSTANTS: Final = np.dtype(
-    [("interval_ns", np.int64), ("transmission_ns", np.int64), ("window_ns", np.int64)]
+    [("interval_ns", np.int64), ("transmission_ns", np.int64), ("counter_step", np.int64)]
 )
 """Parameters of `ClockModel`."""
 
@@ -47,7 +64,7 @@ STATE: Final = np.dtype(
         ("counter", np.int64),  # of the latest sample
         ("elapsed_ns", np.int64),
         ("arrival_ns", np.int64),
-        ("t_ns", np.int64),
+        ("t_ns", np.int64),  # of its stamp, on the scale of the arrivals
         ("origin_x", np.int64),  # elapsed time at x = 0 of the envelope
         ("origin_y", np.int64),  # arrival less elapsed time at y = 0
         ("envelope", ENVELOPE),
@@ -55,6 +72,10 @@ STATE: Final = np.dtype(
         ("ahead", np.float64),  # of the stamps, against the line, ns
         ("worst_ns", np.int64),  # see `ClockReport`
         ("stalls", np.int64, len(STALL_EDGES_S) + 1),
+        ("offset_ns", np.int64),  # of the timebase in use
+        ("stepped", np.bool_),  # the next sample is the first of another timebase
+        ("woken", np.bool_),  # it is the first after a suspend
+        ("steps", np.int64),
     ],
     align=True,
 )
@@ -65,6 +86,7 @@ STAMP: Final = np.dtype(
         ("elapsed_ns", np.int64),  # end of the interval by the counter
         ("t_ns", np.int64),  # and by the host clock, ns since the UNIX epoch
         ("locked", np.bool_),  # the host time is to be trusted
+        ("stepped", np.bool_),  # the first of another timebase
     ],
     align=True,
 )
@@ -86,6 +108,8 @@ class ClockReport(NamedTuple):
         Histogram of the delays of locked samples above the line, with bins between `STALL_EDGES_S`.
     worst_s : float
         Longest such delay.
+    steps : int
+        Number of times that the host's clock was set, or the host slept, since the first sample.
     """
 
     locked: bool
@@ -93,16 +117,19 @@ class ClockReport(NamedTuple):
     floor_s: float | None
     stalls: tuple[int, ...]
     worst_s: float
+    steps: int
 
 
 class ClockModel:
     """Clock of one unit against the host's; any cut of the samples into pieces gives the same bits.
 
-    Stamps increase strictly, always. While locked they are ``1 + skew`` times the time by the counter apart,
-    and `SLEW` of it more or less while they follow a new line. A sample is not locked before 10 s of data
-    give a line; until then stamps follow the least delay so far. These break the line, and a new one begins:
-    the counter steps back or does not agree with `elapsed_ns`, a gap is longer than the window, arrivals step
-    back, are 5 ms early, or are 20 ms late for 10 s. Stamps that are then ahead wait at half speed.
+    Stamps increase strictly, except where the host's clock was set back. While locked they are ``1 + skew``
+    times the time by the counter apart, and `SLEW` of it more or less while they follow a new line. A sample
+    is not locked before 10 s of data give a line; until then stamps follow the least delay so far. These
+    break the line, and a new one begins: the counter steps back or does not agree with `elapsed_ns`, a gap is
+    longer than the window, the host has slept, arrivals step back, are 5 ms early, or are 20 ms late for
+    10 s. Stamps that are then ahead, as after old samples from a buffer, advance by a hundredth of an
+    interval a sample until the host has caught up.
 
     Parameters
     ----------
@@ -110,17 +137,35 @@ class ClockModel:
         Sample interval.
     transmission_ns : int, optional
         Least time from the end of an interval to the arrival: a frame's time on the wire.
-    window_s : float, optional
-        Length of the envelope.
+    counter_step : int, optional
+        Change of the counter from a sample to the next.
     """
 
-    def __init__(self, interval_ns: int, transmission_ns: int = 0, window_s: float = 90.0) -> None:
-        window_ns = round(window_s * NS_PER_S)
-        self._constants = np.array([(interval_ns, transmission_ns, window_ns)], CONSTANTS)
+    def __init__(self, interval_ns: int, transmission_ns: int = 0, counter_step: int = 1) -> None:
+        self._constants = np.array([(interval_ns, transmission_ns, counter_step)], CONSTANTS)
         self._state = np.zeros(1, STATE)
-        self._points = room_for_points(window_ns)
+        self._points = room_for_points(WINDOW_NS)
         self._stamps = np.empty(_ROOM, STAMP)
         self._taken = self._fed = 0
+        self._timebase = Timebase()
+
+    def follow(self, timebase: Timebase) -> None:
+        """Use a timebase for the samples that are fed from now on; the one in use changes nothing.
+
+        Parameters
+        ----------
+        timebase : Timebase
+            That of the next arrival.
+        """
+        if timebase == self._timebase:
+            return
+        s = self._state[0]
+        if s["started"]:
+            s["stepped"] = True
+            s["woken"] |= timebase.slept_ns != self._timebase.slept_ns
+            s["steps"] += 1
+        s["offset_ns"] = timebase.offset_ns
+        self._timebase = timebase
 
     def feed(self, pulses: Records) -> Records:
         """Stamp samples.
@@ -153,7 +198,8 @@ class ClockModel:
         Returns
         -------
         ndarray of INCREMENTS
-            The same, with `Flag.CLOCK_UNLOCKED` where the time is not to be trusted.
+            The same, with `Flag.CLOCK_UNLOCKED` where the time is not to be trusted, and
+            `Flag.CLOCK_STEPPED` on the first one after the host's clock was set or the host slept.
 
         Raises
         ------
@@ -178,6 +224,7 @@ class ClockModel:
             floor_s=float(floor_ns * NS) if e["fitted"] else None,
             stalls=tuple(s["stalls"].tolist()),
             worst_s=float(s["worst_ns"] * NS),
+            steps=int(s["steps"]),
         )
 
     def _make_room(self, count: int) -> None:
@@ -211,14 +258,16 @@ def _feed(
             most = SLEW * dx
             s["ahead"] -= min(max(s["ahead"], -most), most)
         else:
-            s["ahead"] = max(s["ahead"] - _CATCH_UP * dx, 0.0)
+            s["ahead"] = max(s["ahead"] - (dx - _WAIT * min(dx, c["interval_ns"])), 0.0)
             s["locked"] = e["fitted"] and s["ahead"] == 0.0
         on_line = height(line_of(e), x)
         if s["locked"]:
             _count_stall(y - on_line, s)
         s["t_ns"] = sample["elapsed_ns"] + s["origin_y"] + np.int64(np.rint(on_line + s["ahead"]))
         stamp = stamps[i]
-        stamp["elapsed_ns"], stamp["t_ns"], stamp["locked"] = sample["elapsed_ns"], s["t_ns"], s["locked"]
+        stamp["elapsed_ns"], stamp["t_ns"] = sample["elapsed_ns"], s["t_ns"] + s["offset_ns"]
+        stamp["locked"], stamp["stepped"] = s["locked"], s["stepped"]
+        s["stepped"] = False
 
 
 @kernel
@@ -227,31 +276,41 @@ def _place(sample: np.void, c: np.void, s: np.void, points: NDArray[np.int64]) -
     e = s["envelope"]
     arrival_ns = min(max(sample["arrival_ns"], 0), _LATEST_NS) - c["transmission_ns"]
     dx = sample["elapsed_ns"] - s["elapsed_ns"]
-    steps = sample["counter"] - s["counter"]
+    steps = (sample["counter"] - s["counter"]) // c["counter_step"]
     x = sample["elapsed_ns"] - s["origin_x"]
     y = arrival_ns - sample["elapsed_ns"] - s["origin_y"]
     continues = (
         s["started"]
+        and not s["woken"]
         and steps > 0
-        and dx == steps * c["interval_ns"]
+        and 0 <= dx - steps * c["interval_ns"] <= steps  # an interval may be a fraction of 1 ns longer
         and arrival_ns > s["arrival_ns"] - _EARLY_NS
     )
     if continues and x >= e["bin_end"]:
         before = height(line_of(e), x - dx)
-        continues = close_bin(e, points, x, c["window_ns"])
+        continues = close_bin(e, points, x, WINDOW_NS)
         s["ahead"] += above(line_of(e), x - dx, before)  # the stamps stay where they are
-    if continues and e["fitted"]:
-        continues = y > height(line_of(e), x) - _EARLY_NS
+    if continues and e["stop"] > e["first"]:
+        continues = y > _least(e, points, x) - _EARLY_NS
     if not continues:
-        if dx <= 0 or dx > c["window_ns"]:
+        if dx <= 0 or dx > WINDOW_NS:
             dx = c["interval_ns"]
         s["ahead"] = float(s["t_ns"] + dx - arrival_ns) if s["started"] else 0.0
         s["origin_x"], s["origin_y"] = sample["elapsed_ns"], arrival_ns - sample["elapsed_ns"]
         begin(e)
-        s["started"], s["locked"] = True, False
+        s["started"], s["locked"], s["woken"] = True, False, False
         x = y = 0
     s["counter"], s["elapsed_ns"], s["arrival_ns"] = sample["counter"], sample["elapsed_ns"], arrival_ns
     return _Place(dx, x, y)
+
+
+@kernel
+def _least(e: np.void, points: NDArray[np.int64], x: int) -> float:
+    """Return the least y to expect: that of the line; before there is one, of the first bin less the skew."""
+    if e["fitted"]:
+        return height(line_of(e), x)
+    first = e["first"]
+    return float(points[1, first] - MAX_SKEW * (x - points[0, first]))
 
 
 @kernel
@@ -270,12 +329,16 @@ def _stamp(increments: Records, stamps: Records, taken: int, fed: int) -> int:
     """Replace times by the counter with stamps; return the first stamp not taken, -1 for an unknown time."""
     for i in range(len(increments)):
         increment = increments[i]
+        stepped = False
         while taken < fed and stamps[taken]["elapsed_ns"] != increment["t_ns"]:
+            stepped |= stamps[taken]["stepped"]
             taken += 1
         if taken == fed:
             return -1
         increment["t_ns"] = stamps[taken]["t_ns"]
         if not stamps[taken]["locked"]:
             increment["flags"] |= _UNLOCKED
+        if stepped or stamps[taken]["stepped"]:
+            increment["flags"] |= _STEPPED
         taken += 1
     return taken

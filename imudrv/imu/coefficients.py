@@ -3,9 +3,8 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from imudrv.arrays import Array
 
 
 def _zeros() -> Array:
@@ -42,13 +41,13 @@ class Coefficients:
     Parameters
     ----------
     gyro_scale : ndarray, shape (3,)
-        rad per pulse.
+        rad per pulse, or per rad of the unit.
     gyro_bias : ndarray, shape (3,)
         rad/s, body axes.
     C_bg : ndarray, shape (3, 3)
         Gyro axes to body.
     accelerometer_scale : ndarray, shape (3,)
-        Pulses per m/s.
+        Pulses per m/s, or m/s of the unit per m/s.
     accelerometer_bias : ndarray, shape (3,)
         m/s^2, on the sensing axes.
     C_ba : ndarray, shape (3, 3)
@@ -57,6 +56,8 @@ class Coefficients:
         Row i: sensing point of accelerometer i, m, body axes. None: no size-effect compensation.
     temperature : TemperatureTerms, optional
         None: no temperature compensation.
+    gyro_in_pulses, accelerometer_in_pulses : bool
+        Whether the scales are of pulses; otherwise of increments in rad and m/s, about 1.
     """
 
     gyro_scale: Array
@@ -67,3 +68,5 @@ class Coefficients:
     C_ba: Array
     r_b: Array | None = None
     temperature: TemperatureTerms | None = None
+    gyro_in_pulses: bool = True
+    accelerometer_in_pulses: bool = True

@@ -11,21 +11,23 @@ parts, one for each sample interval; as the tangential part of the size effect t
 not stay in velocity.
 """
 
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from imudrv.arrays import Array
+from imudrv.errors import InputError
 from imudrv.imu.coefficients import Coefficients
-from imudrv.imu.rate_filter import RateFilter
+from imudrv.imu.rate_filter import RateFilter, RateFilterName
+from imudrv.imu.rate_filter import rate_filter as make_filter
 from imudrv.imu.size_effect import SIZE_EFFECT, SizeEffect, dv_r, size_effect_constants, unpack_size_effect
 from imudrv.kernels import kernel
 from imudrv.records import INCREMENTS, Flag, Records
 from imudrv.units import NS
 from imudrv.vectors import Matrix, Vector, add, matrix, put, rotate, row, scale, subtract, times, vector_at
 from imudrv.wire.layout import Layout
-
-Array = NDArray[np.float64]
 
 MAX_TAPS: Final = 32
 """Longest rate filter."""
@@ -48,6 +50,7 @@ CONSTANTS: Final = np.dtype(
         ("channels", np.int64, 4),  # temperatures of the gyros and of each accelerometer; -1: not measured
         ("has_size_effect", np.bool_),
         ("size_effect", SIZE_EFFECT),
+        ("counter_step", np.int64),  # from a sample to the next
         ("interval_ns", np.int64),  # of one sample
         ("lag", np.int64),  # of the rate filter, samples
         ("length", np.int64),  # of its taps
@@ -85,10 +88,10 @@ class Compensator:
     coefficients : Coefficients
         The calibration.
     layout : Layout
-        Sample interval and temperature channels of the profile.
-    rate_filter : RateFilter
-        For the size effect, of at most `MAX_TAPS` taps. Its lag delays increments only where there is a size
-        effect to compensate.
+        Layout of the profile: sample interval, axes, temperature channels.
+    rate_filter : {'causal', 'centred', 'dither'}
+        Filter of the rate for the size effect, see `imudrv.imu.rate_filter`. Its lag delays increments only
+        where there is a size effect to compensate.
 
     Attributes
     ----------
@@ -96,38 +99,56 @@ class Compensator:
         Whether there is a size effect to compensate.
     """
 
-    def __init__(self, coefficients: Coefficients, layout: Layout, rate_filter: RateFilter) -> None:
+    def __init__(
+        self, coefficients: Coefficients, layout: Layout, rate_filter: RateFilterName = "causal"
+    ) -> None:
+        require_sensors(coefficients, layout)
+        gyro, accelerometer = layout.missing_axes
+        if gyro or len(accelerometer) == 3:
+            coefficients = replace(coefficients, r_b=None)  # the size effect needs all angular rates
+        self._missing = [
+            (name, axes, out, C[:, axes].any(axis=1))
+            for name, axes, out, C in (
+                ("gyro", gyro, "dtheta_b", np.asarray(coefficients.C_bg)),
+                ("accelerometer", accelerometer, "dv_b", np.asarray(coefficients.C_ba)),
+            )
+            if axes
+        ]
         self.has_size_effect = coefficients.r_b is not None
-        self._constants = _constants(coefficients, layout, rate_filter)
+        self._constants = _constants(coefficients, layout, make_filter(rate_filter, layout.interval_ns))
         self._state = np.zeros(1, STATE)
-        self._lag = rate_filter.lag
         self._waiting = _NOTHING
 
     @property
     def lag(self) -> int:
         """Delay of the output, samples."""
-        return self._lag if self.has_size_effect else 0
+        return int(self._constants[0]["lag"]) if self.has_size_effect else 0
 
     def feed(self, pulses: Records) -> Records:
         """Compensate pulses.
 
         Parameters
         ----------
-        pulses : ndarray of PULSES
+        pulses : ndarray of `imudrv.records.samples_type`
             In order.
 
         Returns
         -------
         ndarray of INCREMENTS
-            Those that are ready; `t_ns` is the time by the counter, `elapsed_ns` of the pulses.
+            Those that are ready; `t_ns` is the time by the counter, `elapsed_ns` of the pulses. NaN for a
+            body axis that an axis missing in the unit is a part of.
         """
+        if self._missing:
+            pulses = pulses.copy()
+            for name, axes, _, _ in self._missing:
+                pulses[name][:, axes] = 0
         waiting = len(self._waiting)
         out = np.empty(waiting + len(pulses), INCREMENTS)
         if waiting:
             out[:waiting] = self._waiting
         ready = _compensate(pulses, out, waiting, self._constants, self._state)
         self._waiting = out[ready:].copy() if ready < len(out) else _NOTHING
-        return out[:ready]
+        return self._without_missing(out[:ready])
 
     def close(self) -> Records:
         """End the stream.
@@ -140,7 +161,41 @@ class Compensator:
         rest, self._waiting = self._waiting, _NOTHING
         _finish_plainly(rest, matrix(self._constants[0]["C_ba"]))
         self._state = np.zeros(1, STATE)
-        return rest
+        return self._without_missing(rest)
+
+    def _without_missing(self, increments: Records) -> Records:
+        """Set to NaN what an axis that the unit lacks would be a part of."""
+        for _, _, out, axes_b in self._missing:
+            increments[out][:, axes_b] = np.nan
+        return increments
+
+
+def require_sensors(coefficients: Coefficients, layout: Layout) -> None:
+    """Check that a calibration is of the numbers that the unit sends.
+
+    Parameters
+    ----------
+    coefficients : Coefficients
+        The calibration.
+    layout : Layout
+        Layout of the profile.
+
+    Raises
+    ------
+    InputError
+        It is of pulses, and the unit sends other units, or the other way round.
+    """
+    for name, sensor, of_pulses, key in (
+        ("gyro", layout.gyro, coefficients.gyro_in_pulses, "scale_arcsec_per_pulse"),
+        ("accelerometer", layout.accelerometer, coefficients.accelerometer_in_pulses, "scale_pulse_per_m_s"),
+    ):
+        if any(sensor.axes) and sensor.in_pulses != of_pulses:
+            keys = (key, "scale") if sensor.in_pulses else ("scale", key)
+            raise InputError(
+                f"{name}: expected a calibration with {name}.{keys[0]} for {layout.name}, which sends "
+                f"{'pulses' if sensor.in_pulses else 'other units than pulses'}, got one with "
+                f"{name}.{keys[1]}; use the certificate of the unit, or the right profile"
+            )
 
 
 def _constants(c: Coefficients, layout: Layout, rate_filter: RateFilter) -> Records:
@@ -158,6 +213,7 @@ def _constants(c: Coefficients, layout: Layout, rate_filter: RateFilter) -> Reco
         k["accelerometer_bias_per_k"] = t.accelerometer_bias
         k["channels"] = _temperature_channels(layout)
     interval_s, taps = layout.interval_ns * NS, rate_filter.taps
+    k["counter_step"] = layout.counter_step
     k["interval_ns"], k["lag"], k["length"] = layout.interval_ns, rate_filter.lag, len(taps)
     k["taps"][: len(taps)] = taps / interval_s
     if c.r_b is not None:
@@ -221,6 +277,8 @@ def _scale(pulses: Records, out: Records, c: np.void) -> None:
         put(increment["dtheta_b"], 0, subtract(rotate(C_bg, gyro), scale(T, at.gyro_bias)))
         put(increment["dv_b"], 0, subtract(accelerometer, scale(T, at.accelerometer_bias)))
         increment["counter"], increment["t_ns"] = sample["counter"], sample["elapsed_ns"]
+        if c["counter_step"] != 1:
+            increment["counter"] //= c["counter_step"]
         increment["interval_ns"] = sample["interval_ns"]
         increment["flags"] = sample["flags"] if at.in_range else sample["flags"] | _TEMPERATURE_RANGE
 

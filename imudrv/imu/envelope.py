@@ -110,7 +110,8 @@ def add_point(e: np.void, x: int, y: int) -> float:
 def close_bin(e: np.void, points: NDArray[np.int64], x: int, window_ns: int) -> bool:
     """Keep the lowest point of the open bin, which ends before x, and find the line of the window up to x.
 
-    Returns False where a line that was fitted does not hold any more, or nothing is left of the window.
+    Returns False where a line that was fitted does not hold any more, no line fits `MIN_BINS` bins, or
+    nothing is left of the window.
     """
     first, stop = e["first"], e["stop"]
     if stop == points.shape[1]:
@@ -134,7 +135,7 @@ def close_bin(e: np.void, points: NDArray[np.int64], x: int, window_ns: int) -> 
         good = abs(line.skew) <= MAX_SKEW and clearance <= MAX_CLEARANCE_NS
         e["clearance"] = clearance
     if not good:
-        if e["fitted"]:
+        if e["fitted"] or stop - first >= MIN_BINS:
             return False
         line = Line(0.0, float(points[1, first:stop].min()), 0.0)
     e["x0"], e["y0"], e["skew"] = line

@@ -5,6 +5,7 @@ and velocity alike, is output L samples later.
 """
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Final, Literal, TypeAlias
 
 import numpy as np
@@ -46,6 +47,7 @@ class RateFilter:
     middle_from_ends: bool = False
 
 
+@cache
 def rate_filter(name: RateFilterName, interval_ns: int) -> RateFilter:
     """Make the filter called `name` for a sample interval.
 

@@ -16,13 +16,12 @@ a . [w x]^2 r = q . (products of the components of w).
 from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from imudrv.arrays import Array
 from imudrv.kernels import kernel
 from imudrv.records import Records
 from imudrv.vectors import Matrix, Vector, add, matrix, rotate, scale, subtract
 
-Array = NDArray[np.float64]
 Vector6: TypeAlias = tuple[float, float, float, float, float, float]
 
 SIZE_EFFECT: Final = np.dtype(

@@ -63,6 +63,12 @@ def rotation(axis: ArrayLike, angle_rad: float) -> Array:
     -------
     ndarray, shape (3, 3)
         The same in the axes before and after, because the axis has the same components in both.
+
+    Examples
+    --------
+    >>> R = rotation([0, 0, 1], np.pi / 2)
+    >>> print((R @ [1, 0, 0]).round(12))
+    [0. 1. 0.]
     """
     u = np.asarray(axis, np.float64)
     u = u / np.linalg.norm(u)
@@ -155,6 +161,11 @@ def quaternion_of_matrix(R: ArrayLike) -> Array:
     ndarray, shape (4,)
         Scalar first and not negative. The largest component is computed first, so that nothing cancels
         (Shepperd, Journal of Guidance and Control 1 (1978) 223).
+
+    Examples
+    --------
+    >>> print(quaternion_of_matrix(rotation([0, 0, 1], np.pi / 2)).round(4))
+    [0.7071 0.     0.     0.7071]
     """
     m = np.asarray(R, np.float64)
     four_products = np.array(  # q[i] q[j], four times

@@ -48,7 +48,7 @@ Time without increments is not navigated; a row has the flags of its sample.
 """
 
 from math import cos, sin, sqrt
-from typing import Final, NamedTuple, Protocol, Self
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -130,24 +130,13 @@ MAX_LATITUDE: Final = 1.5
 """Largest latitude, rad: east and north have no meaning at the poles."""
 
 
-class Place(Protocol):
-    """A place on the Earth, such as `imudrv.site.Site`."""
+class Place(NamedTuple):
+    """A place on the Earth."""
 
-    @property
-    def latitude_rad(self) -> float:
-        """Geodetic latitude, rad."""
-
-    @property
-    def longitude_rad(self) -> float:
-        """Longitude, rad."""
-
-    @property
-    def height_m(self) -> float:
-        """Height above the ellipsoid, m."""
-
-    @property
-    def gravity_m_s2(self) -> float | None:
-        """Measured gravity, m/s^2, if there is a measurement."""
+    latitude_rad: float  # geodetic
+    longitude_rad: float
+    height_m: float  # above the ellipsoid
+    gravity_m_s2: float | None = None  # measured; None: normal gravity
 
 
 class Navigator:
@@ -155,10 +144,8 @@ class Navigator:
 
     Parameters
     ----------
-    latitude_rad, longitude_rad, height_m : float
-        Position at the start.
-    gravity_m_s2 : float or None
-        Measured there. Its difference from normal gravity is added everywhere. None: normal gravity.
+    place : Place
+        Position at the start. The difference of its gravity from normal gravity is added everywhere.
     q_nb : array_like, shape (4,)
         Attitude at the start.
     v_n : array_like, shape (3,)
@@ -176,10 +163,7 @@ class Navigator:
 
     def __init__(
         self,
-        latitude_rad: float,
-        longitude_rad: float,
-        height_m: float,
-        gravity_m_s2: float | None,
+        place: Place,
         q_nb: ArrayLike,
         v_n: ArrayLike = (0.0, 0.0, 0.0),
         *,
@@ -192,7 +176,8 @@ class Navigator:
                 f"navigation: expected q_nb of length 1 within 1e-6, got {np.linalg.norm(q):.9g}; "
                 "normalise it"
             )
-        position = _checked("latitude, longitude, height", (latitude_rad, longitude_rad, height_m), (3,))
+        latitude_rad, _, height_m, gravity_m_s2 = place
+        position = _checked("latitude, longitude, height", place[:3], (3,))
         if abs(latitude_rad) > MAX_LATITUDE:
             raise InputError(
                 f"navigation: expected a latitude of at most {MAX_LATITUDE} rad, got {latitude_rad:.9g}; "
@@ -213,26 +198,6 @@ class Navigator:
         self._state["v_n"] = _checked("velocity v_n", v_n, (3,))
         self._state["position"] = position
         self._state["earth_at"] = latitude_rad, height_m
-
-    @classmethod
-    def from_site(
-        cls, site: Place, q_nb: ArrayLike, *, C_ba: ArrayLike | None = None, every: int = 1
-    ) -> Self:
-        """Start at rest at a site.
-
-        Parameters
-        ----------
-        site : Site
-            Position, and gravity if it was measured.
-        q_nb, C_ba, every
-            See the class.
-
-        Returns
-        -------
-        Navigator
-        """
-        position = site.latitude_rad, site.longitude_rad, site.height_m
-        return cls(*position, site.gravity_m_s2, q_nb, C_ba=C_ba, every=every)
 
     @property
     def latest(self) -> Records:

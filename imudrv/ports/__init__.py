@@ -1,7 +1,7 @@
 """Ports, opened by URL: where wire bytes and CAN messages come from.
 
 =====================================================  ====================================================
-``serial:///dev/ttyUSB0``, ``/dev/ttyUSB0``, ``COM3``  serial line, settings from the profile
+``serial:///dev/ttyUSB0``, ``/dev/ttyUSB0``            serial line, settings from the profile
 ``serial:///dev/serial/by-id/usb-FTDI_...``            by its stable name, the same in any USB socket
 ``...?baudrate=460800&parity=even``                    other settings: ``baudrate``, ``bytesize`` 5-8,
                                                        ``parity`` none, even, odd, mark, space,
@@ -28,11 +28,10 @@ Values in a query are percent-decoded; an address is taken literally, up to the 
 from collections.abc import Callable
 from functools import partial
 
-from imudrv.errors import InputError
 from imudrv.ports.base import Port, PortEndedError, PortLostError
-from imudrv.ports.url import PYSERIAL, SCHEMES, split
 from imudrv.profiles.schema import Profile
 from imudrv.records import Arrival
+from imudrv.url import split
 
 __all__ = ["Arrival", "Port", "PortEndedError", "PortLostError", "check_url", "open_port"]
 
@@ -83,20 +82,18 @@ def check_url(url: str, profile: Profile) -> None:
 def _opener(url: str, profile: Profile) -> Callable[[], Port]:
     """Check a URL and return what opens it; libraries are loaded only where needed."""
     parts = split(url)
-    if parts.scheme == "serial" or parts.scheme in PYSERIAL:
-        from imudrv.ports import serial
+    if parts.scheme == "sim":
+        from imudrv.ports.simulated import open_simulated
 
-        return serial.prepare(parts, profile)
-    if parts.scheme == "can":
-        from imudrv.ports import can
-
-        return can.prepare(parts, profile)
+        return partial(open_simulated, parts, profile)
     if parts.scheme == "replay":
         from imudrv.ports import replay
 
         return replay.prepare(parts, profile)
-    if parts.scheme == "sim":
-        from imudrv.ports.simulated import open_simulated
+    if parts.scheme == "can":
+        from imudrv.ports import can
 
-        return partial(open_simulated, url, profile)
-    raise InputError(f"{url}: expected a URL that begins with {', '.join(SCHEMES)}, got {parts.scheme}://")
+        return can.prepare(parts, profile)
+    from imudrv.ports import serial
+
+    return serial.prepare(parts, profile)

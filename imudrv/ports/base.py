@@ -1,9 +1,12 @@
 """Interface of a port, the source of wire bytes or CAN messages with their times of arrival."""
 
 from abc import ABC, abstractmethod
+from typing import NamedTuple, Self
 
-from imudrv.errors import Imu50Error
+from imudrv.errors import Imu50Error, InputError
+from imudrv.profiles.schema import Profile
 from imudrv.records import Arrival, Source
+from imudrv.url import Url
 
 
 class PortLostError(Imu50Error):
@@ -12,6 +15,31 @@ class PortLostError(Imu50Error):
 
 class PortEndedError(Imu50Error):
     """A replay or a simulation has ended; this is no fault."""
+
+
+class LineErrors(NamedTuple):
+    """Errors that the driver of a serial line has counted.
+
+    Parameters
+    ----------
+    framing, parity : int
+        Bytes without a stop bit where one was expected, and with a wrong parity bit.
+    overrun : int
+        Bytes lost in the hardware, or because the buffer of the driver was full.
+    """
+
+    framing: int = 0
+    parity: int = 0
+    overrun: int = 0
+
+    def since(self, before: Self) -> "LineErrors":
+        """Return the errors since an earlier count."""
+        return LineErrors(*(now - then for now, then in zip(self, before, strict=True)))
+
+    def __str__(self) -> str:
+        """Errors that occurred, such as ``12 framing errors, 3 overruns``; empty if none."""
+        names = ("framing errors", "parity errors", "overruns")
+        return ", ".join(f"{count} {name}" for count, name in zip(self, names, strict=True) if count)
 
 
 class Port(ABC):
@@ -56,6 +84,26 @@ class Port(ABC):
             There are no more data.
         """
 
+    def line_errors(self) -> LineErrors:
+        """Return the errors that the driver has counted; zeros where it does not count."""
+        return LineErrors()
+
     @abstractmethod
     def close(self) -> None:
         """Close the device."""
+
+
+def require_transport(url: Url, profile: Profile, transport: str) -> None:
+    """Refuse a profile whose transport is not that of the port.
+
+    Raises
+    ------
+    InputError
+        The message names the URLs that fit the profile.
+    """
+    if profile.transport != transport:
+        fitting = "can://INTERFACE/CHANNEL" if profile.transport == "can" else "serial:///dev/..."
+        raise InputError(
+            f"{url.text}: expected a port for the {profile.transport} profile {profile.name}, "
+            f"like {fitting}, got a {transport} port; change the URL or the profile"
+        )

@@ -5,7 +5,6 @@ import errno
 import logging
 import os
 import socket
-import struct
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
@@ -18,17 +17,15 @@ import numpy as np
 from imudrv.errors import InputError
 from imudrv.files import settings_file
 from imudrv.hostclock import now_ns
-from imudrv.ports.base import Port, PortLostError
+from imudrv.ports.base import Port, PortLostError, require_transport
 from imudrv.ports.serial import explain
-from imudrv.ports.url import Url, require_transport, value
 from imudrv.profiles.schema import CanLine, Profile
-from imudrv.records import MESSAGE, Arrival, Records, Source
+from imudrv.records import EXTENDED, MESSAGE, MESSAGE_ROW, Arrival, Records, Source
+from imudrv.url import Url, value
 
 # Our messages contain what python-can logs; without a handler it would go to the terminal.
 logging.getLogger("can").addHandler(logging.NullHandler())
 
-_ROW: Final = struct.Struct("=qIBB64s2x")
-"""A row of MESSAGE; the data are padded with zeros."""
 _AT_ONCE: Final = 4096
 """Maximum number of messages of one read."""
 _BUFFER_BYTES: Final = 1 << 22
@@ -81,7 +78,14 @@ def prepare(url: Url, profile: Profile) -> "Callable[[], CanPort]":
     asked = {name: options.pop(name) for name in CanLine.model_fields if name in options}
     line = settings_file.parse({**profile.line.model_dump(), **asked}, CanLine, url.text)
     options |= _rates(url, interface, line, fd)
-    filters = [{"can_id": message.id, "can_mask": _ID_MASK} for message in profile.messages]
+    filters = [
+        {
+            "can_id": kind.can_id & _ID_MASK,
+            "can_mask": kind.can_mask & _ID_MASK,
+            "extended": bool(kind.can_id & EXTENDED),
+        }
+        for kind in profile.layout().messages
+    ]
     return partial(_open, url.text, interface, channel, {**options, "can_filters": filters})
 
 
@@ -113,7 +117,8 @@ class CanPort(Port):
                     raise self._bus_off()
             elif not message.is_remote_frame:
                 data, identifier = message.data, message.arbitration_id & _ID_MASK
-                rows.append(_ROW.pack(now_ns(), identifier, len(data), message.is_fd, data))
+                identifier |= EXTENDED * message.is_extended_id
+                rows.append(MESSAGE_ROW.pack(now_ns(), identifier, len(data), message.is_fd, data))
             message = self._receive(0) if len(rows) < _AT_ONCE else None
         if not rows and self._is_off():
             raise self._bus_off()

@@ -22,16 +22,15 @@ import numpy as np
 from imudrv.errors import InputError
 from imudrv.hostclock import now_ns
 from imudrv.ports.base import Port, PortEndedError, PortLostError
-from imudrv.ports.url import Url
 from imudrv.profiles.schema import Profile
 from imudrv.records import MESSAGE, Arrival, Records, Source
 from imudrv.units import NS
+from imudrv.url import Url, speed_of
 from imudrv.wire.candump import CandumpDecoder
 from imudrv.wire.layout import Layout
 
 _CHUNK_BYTES: Final = 1 << 16
 _STEP_NS: Final = 1_000_000
-_FASTEST: Final = 1e6
 
 Pieces = Generator[Arrival, None, None]
 
@@ -66,7 +65,7 @@ def prepare(url: Url, profile: Profile) -> Callable[[], Port]:
         raise InputError(
             f"{url.text}: expected no option but {' and '.join(options)}, got {', '.join(unknown)}"
         )
-    speed = _speed(url)
+    speed = speed_of(url.options.get("speed", "1"))
     try:
         with path.open("rb") as file:
             empty = not file.read(1)
@@ -141,19 +140,6 @@ class ReplayPort(Port):
         if self._begin_ns is None:
             self._begin_ns = now
         return self._first_ns + int((now - self._begin_ns) * speed)
-
-
-def _speed(url: Url) -> float | None:
-    text = url.options.get("speed", "1")
-    if text == "max":
-        return None
-    try:
-        speed = float(text)
-    except ValueError:
-        speed = math.nan
-    if not 0 < speed <= _FASTEST:
-        raise InputError(f"{url.text}: speed: expected max or a factor up to {_FASTEST:g}, got {text!r}")
-    return speed
 
 
 def _open(url: str, path: Path, layout: Layout, speed: float | None, channel: str | None) -> Port:

@@ -5,44 +5,37 @@ the lowest latency; other devices are read by pyserial.
 """
 
 import errno
+import fcntl
 import os
 import select
 import socket
+import struct
+import termios
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
-from urllib.parse import urlencode, urlsplit
+from typing import Any, Final, cast
+from urllib.parse import urlencode
 
 import serial
 from serial.tools.list_ports import comports
 
 from imudrv.errors import InputError
-from imudrv.files import settings_file
 from imudrv.hostclock import now_ns
-from imudrv.ports.base import Port, PortLostError
-from imudrv.ports.url import Url, require_transport, value
+from imudrv.ports.base import LineErrors, Port, PortLostError, require_transport
+from imudrv.ports.holders import holders
 from imudrv.profiles.schema import Profile, SerialLine
 from imudrv.records import Arrival, Source
+from imudrv.url import Url, device_path, host_and_port, serial_settings
 
 _AT_ONCE: Final = 1 << 16
 _SLICE_S: Final = 0.02
 """Longest wait inside pyserial, s; a change of its timeout would set up an open line again."""
 _CONNECT_S: Final = 1.0
-_PARITY: Final = {
-    "none": serial.PARITY_NONE,
-    "even": serial.PARITY_EVEN,
-    "odd": serial.PARITY_ODD,
-    "mark": serial.PARITY_MARK,
-    "space": serial.PARITY_SPACE,
-}
 _SHOWN_PORTS: Final = 10
-_SYSTEM_ERRORS: tuple[type[Exception], ...] = (OSError,)
-if os.name == "posix":
-    import termios
-
-    _SYSTEM_ERRORS += (termios.error,)
+_TIOCGICOUNT: Final = 0x545D  # Linux, asm-generic/ioctls.h
+_COUNTS: Final = struct.Struct("20i")  # struct serial_icounter_struct, linux/serial.h
 
 
 def prepare(url: Url, profile: Profile) -> Callable[[], Port]:
@@ -67,18 +60,16 @@ def prepare(url: Url, profile: Profile) -> Callable[[], Port]:
     """
     require_transport(url, profile, "serial")
     if url.scheme == "socket":
-        return partial(_connect, url.text, _host_and_port(url))
-    own = url.options
-    foreign: dict[str, str] = {}
+        return partial(_connect, url.text, host_and_port(url))
+    own = url
     if url.scheme == "serial":
-        _require_device_name(url)
-        target = url.address
+        target = _device(url)
     else:
-        own = {name: text for name, text in url.options.items() if name in SerialLine.model_fields}
-        foreign = {name: text for name, text in url.options.items() if name not in own}
+        foreign = {name: text for name, text in url.options.items() if name not in SerialLine.model_fields}
+        own = url._replace(options={name: text for name, text in url.options.items() if name not in foreign})
         target = f"{url.scheme}://{url.address}" + (f"?{urlencode(foreign)}" if foreign else "")
-    asked = {**profile.line.model_dump(), **{name: value(text) for name, text in own.items()}}
-    return partial(_open, url.text, target, settings_file.parse(asked, SerialLine, url.text))
+    line = cast(SerialLine, profile.line)  # by `require_transport`
+    return partial(_open, url.text, target, serial_settings(own, line))
 
 
 def explain(device: str, error: OSError) -> str:
@@ -102,9 +93,25 @@ def explain(device: str, error: OSError) -> str:
         case errno.EACCES | errno.EPERM:
             return f"no permission for {device}; {_who_may(device)}"
         case errno.EBUSY | errno.EAGAIN:
-            return f"another program has {device} open; end it (`fuser -v {device}` names it)"
+            users, _ = holders(Path(device).resolve())
+            who = ", ".join(users) or f"another program (`sudo fuser -v {device}` names it)"
+            return f"{device} is open in {who}: end that program"
         case _:
             return f"cannot open {device}: {error.strerror or error}"
+
+
+def take_exclusively(descriptor: int) -> None:
+    """Refuse the line to programs that open it later, where the driver can.
+
+    Pyserial's lock is advisory: `cat`, which does not ask for it, would take a part of the bytes.
+
+    Parameters
+    ----------
+    descriptor : int
+        File descriptor of the open line.
+    """
+    with suppress(OSError):
+        fcntl.ioctl(descriptor, termios.TIOCEXCL)
 
 
 class DescriptorPort(Port):
@@ -123,10 +130,7 @@ class DescriptorPort(Port):
     def __init__(self, url: str, device: serial.Serial | socket.socket) -> None:
         super().__init__(url, Source.HARDWARE)
         self._device = device
-        self._ready = [device.fileno()]
-        self._take: Callable[[int], bytes] = (
-            device.recv if isinstance(device, socket.socket) else partial(os.read, device.fileno())
-        )
+        self._fd = device.fileno()
         self._closed = False
 
     def read(self, timeout_s: float) -> Arrival:
@@ -134,8 +138,8 @@ class DescriptorPort(Port):
         if self._closed:
             raise PortLostError(f"{self.url}: the port is closed")
         try:
-            ready = select.select(self._ready, (), (), timeout_s)[0]
-            data = self._take(_AT_ONCE) if ready else b""
+            ready = select.select([self._fd], (), (), timeout_s)[0]
+            data = os.read(self._fd, _AT_ONCE) if ready else b""
         except BlockingIOError:
             return Arrival(now_ns(), b"")
         except OSError as error:
@@ -144,6 +148,17 @@ class DescriptorPort(Port):
         if ready and not data:
             raise PortLostError(f"{self.url}: the other end has gone")
         return Arrival(t_ns, data)
+
+    def line_errors(self) -> LineErrors:
+        """See `Port.line_errors`."""
+        if self._closed:
+            return LineErrors()
+        try:
+            counts = fcntl.ioctl(self._fd, _TIOCGICOUNT, bytes(_COUNTS.size))
+        except OSError:  # a pty, a socket, or a driver that does not count
+            return LineErrors()
+        framing, overrun, parity, _, buffer_overrun = _COUNTS.unpack(counts)[6:11]
+        return LineErrors(framing, parity, overrun + buffer_overrun)
 
     def close(self) -> None:
         """See `Port.close`."""
@@ -184,18 +199,10 @@ class PyserialPort(Port):
         self._device.close()
 
 
-def _open(url: str, target: str, line: SerialLine) -> Port:
-    settings: dict[str, Any] = {
-        "baudrate": line.baudrate,
-        "bytesize": line.bytesize,
-        "parity": _PARITY[line.parity],
-        "stopbits": line.stopbits,
-        "timeout": _SLICE_S,
-        "exclusive": True if os.name == "posix" else None,
-    }
+def _open(url: str, target: str, settings: dict[str, Any]) -> Port:
     try:
-        device = serial.serial_for_url(target, do_not_open=True, **settings)
-        # Otherwise opening a POSIX device discards its input buffer.
+        device = serial.serial_for_url(target, do_not_open=True, timeout=_SLICE_S, exclusive=True, **settings)
+        # Otherwise opening a device discards its input buffer.
         vars(device)["_reset_input_buffer"] = lambda: None
         device.open()
     except KeyError as error:  # raised by pyserial while it reports an unknown option
@@ -205,13 +212,15 @@ def _open(url: str, target: str, line: SerialLine) -> Port:
         if isinstance(cause, OSError) and cause.errno != errno.EINVAL:  # unplugged while its speed was set
             raise PortLostError(f"{url}: {explain(target, cause)}") from error
         raise InputError(f"{url}: {error}") from error
-    except _SYSTEM_ERRORS as error:
+    except (OSError, termios.error) as error:
         if "expected a string in the form" in str(error):
             raise InputError(f"{url}: {error}") from error
         reason = error if isinstance(error, OSError) else OSError(*error.args)
         raise PortLostError(f"{url}: {explain(target, reason)}") from error
-    if os.name != "posix" or not isinstance(device, serial.Serial) or target.startswith("spy:"):
+    if not isinstance(device, serial.Serial) or target.startswith("spy:"):
         return PyserialPort(url, device)
+    if not Path(target).resolve().is_relative_to("/dev/pts"):  # the other end of a pty keeps the flag alive
+        take_exclusively(device.fileno())
     with suppress(ValueError, OSError, NotImplementedError):  # not supported by ptys and some drivers
         device.set_low_latency_mode(True)
     return DescriptorPort(url, device)
@@ -229,35 +238,15 @@ def _connect(url: str, address: tuple[str, int]) -> Port:
     return DescriptorPort(url, connection)
 
 
-def _host_and_port(url: Url) -> tuple[str, int]:
-    try:
-        parts = urlsplit(f"//{url.address}")
-        host, port = parts.hostname, parts.port
-    except ValueError:
-        host = port = None
-    if not host or not port or parts.path:
-        raise InputError(f"{url.text}: expected socket://HOST:PORT, got {url.address!r} as the address")
-    if url.options:
-        raise InputError(f"{url.text}: expected no options for socket://, got {', '.join(url.options)}")
-    return host, port
-
-
-def _require_device_name(url: Url) -> None:
-    if os.name == "posix":
-        device = Path(url.address)
-        if not device.is_absolute():
-            raise InputError(
-                f"{url.text}: expected the path of a device like serial:///dev/ttyUSB0 (three slashes), "
-                f"got {url.address!r}"
-            )
-        if device.exists() and not device.is_char_device():
-            kind = "folder" if device.is_dir() else "file"
-            raise InputError(
-                f"{url.text}: expected a serial device, got a {kind}; a capture is read with "
-                f"replay://{url.address}"
-            )
-    elif not url.address:
-        raise InputError(f"{url.text}: expected the name of a device like serial://COM3, got none")
+def _device(url: Url) -> str:
+    device = Path(device_path(url))
+    if device.exists() and not device.is_char_device():
+        kind = "folder" if device.is_dir() else "file"
+        raise InputError(
+            f"{url.text}: expected a serial device, got a {kind}; a capture is read with "
+            f"replay://{url.address}"
+        )
+    return url.address
 
 
 def _ports_there_are() -> str:

@@ -8,21 +8,21 @@ import numpy as np
 from imudrv.errors import InputError
 from imudrv.hostclock import now_ns
 from imudrv.ports.base import Port, PortEndedError, PortLostError
-from imudrv.ports.url import split
 from imudrv.profiles.schema import Profile
 from imudrv.records import MESSAGE, Arrival, Records, Source
-from imudrv.sim.live import AHEAD, MOST, Pace, PacedPlayback, speed_of
+from imudrv.sim.live import AHEAD, MOST, Pace, PacedPlayback
 from imudrv.sim.scenario import Scenario, load
+from imudrv.url import Url, speed_of
 
 _NOTHING: Final = np.zeros(0, MESSAGE)
 
 
-def open_simulated(url: str, profile: Profile) -> Port:
+def open_simulated(url: Url, profile: Profile) -> Port:
     """Open a simulated unit and start its run.
 
     Parameters
     ----------
-    url : str
+    url : Url
         ``sim://NAME`` of a shipped scenario or ``sim://PATH`` of a file; ``?speed=`` 1 (the default),
         any other number, or max.
     profile : Profile
@@ -37,12 +37,9 @@ def open_simulated(url: str, profile: Profile) -> Port:
     InputError
         The scenario does not exist or is not valid, or an option is unknown.
     """
-    parts = split(url)
-    options = dict(parts.options)
-    speed = speed_of(options.pop("speed", "1"))
-    if options:
-        raise InputError(f"{url}: expected no option but speed, got {', '.join(options)}")
-    return SimulatedPort(url, load(parts.address), profile, speed)
+    if unknown := url.options.keys() - {"speed"}:
+        raise InputError(f"{url.text}: expected no option but speed, got {', '.join(unknown)}")
+    return SimulatedPort(url.text, load(url.address), profile, speed_of(url.options.get("speed", "1")))
 
 
 class SimulatedPort(Port):

@@ -5,6 +5,7 @@ channel                a message
 =====================  ==========================================================================
 ``/imu50/wire``        one read of the port at its host time: ``bytes`` as received, or
                        ``can-messages`` (see `pack_messages`)
+``/imu50/clock``       ``json``: the `Timebase` of the reads that follow; the default one until the first
 ``/imu50/increments``  ``i50n``: datagrams back to back
 ``/imu50/status``      ``json``: status of the service
 ``/imu50/events``      ``json``: ``{"text": ...}``, an event of the service
@@ -12,17 +13,24 @@ channel                a message
 
 The attachments ``profile.yaml`` and ``calibration.yaml`` make a recording self-contained; a calibration that
 was exchanged later is attached again at its time. The metadata record ``imu50`` is the recording's origin.
+
+The times of all messages are on the scale of the arrivals, which does not step; those within datagrams are
+UNIX time.
 """
 
 from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
+from imudrv.kernels import kernel
 from imudrv.records import MESSAGE, Records
+from imudrv.wire.fields import Bytes, word
 
 WIRE: Final = "/imu50/wire"
 INCREMENTS: Final = "/imu50/increments"
+CLOCK: Final = "/imu50/clock"
 STATUS: Final = "/imu50/status"
 EVENTS: Final = "/imu50/events"
 
@@ -34,6 +42,12 @@ PROFILE: Final = "profile.yaml"
 CALIBRATION: Final = "calibration.yaml"
 ORIGIN: Final = "imu50"
 """Name of the metadata record."""
+
+MAX_TIME_NS: Final = 2**62
+"""Largest time, and largest offset of a timebase: 146 years."""
+
+_HEAD: Final = 14  # bytes of a packed CAN message before its data
+_LONGEST: Final = 64
 
 
 def pack_messages(pieces: Sequence[Records]) -> list[bytes]:
@@ -65,34 +79,54 @@ def pack_messages(pieces: Sequence[Records]) -> list[bytes]:
     ]
 
 
-def unpack_messages(data: bytes) -> Records:
-    """Decode CAN messages of a recording.
+def unpack_messages(
+    data: NDArray[np.uint8], ends: NDArray[np.int64]
+) -> tuple[Records, NDArray[np.int64], str]:
+    """Decode the CAN messages of several pieces of a recording.
 
     Parameters
     ----------
-    data : bytes
-        From `pack_messages`.
+    data : ndarray of uint8
+        Pieces from `pack_messages`, one behind the other.
+    ends : ndarray of int64, shape (n,)
+        Where each piece ends.
 
     Returns
     -------
-    ndarray of MESSAGE
-
-    Raises
-    ------
-    ValueError
-        The data are no such messages.
+    tuple of ndarray of MESSAGE, ndarray of int64 and str
+        Messages of all pieces up to the first faulty one; where each piece ends in them; what is wrong with
+        the faulty one, empty without any.
     """
-    width = data[0] if data else 65
-    if width > 64:
-        raise ValueError(f"expected the length of CAN data, 0 to 64, got {width}")
-    packed = np.frombuffer(data, _packed_type(width), offset=1)
-    if (packed["length"] > width).any():
-        raise ValueError(f"expected CAN data of at most {width} bytes, got {packed['length'].max()}")
-    messages = np.zeros(packed.size, MESSAGE)
-    for name in ("t_ns", "id", "length", "fd"):
-        messages[name] = packed[name]
-    messages["data"][:, :width] = packed["data"]
-    return messages
+    messages = np.zeros(data.size // _HEAD, MESSAGE)
+    message_ends = np.zeros(len(ends), np.int64)
+    count, good = _unpack(data, ends, messages, message_ends)
+    fault = "" if good == len(ends) else f"expected CAN messages of at most {_LONGEST} bytes, got other bytes"
+    return messages[:count], message_ends[:good], fault
+
+
+@kernel
+def _unpack(
+    data: Bytes, ends: NDArray[np.int64], messages: Records, message_ends: NDArray[np.int64]
+) -> tuple[int, int]:
+    """Return the number of messages, and of pieces up to the first faulty one."""
+    begin = count = 0
+    for k in range(ends.shape[0]):
+        end = ends[k]
+        if begin == end or data[begin] > _LONGEST or (end - begin - 1) % (_HEAD + data[begin]):
+            return count, k
+        width, found = np.int64(data[begin]), count
+        for p in range(begin + 1, end, _HEAD + width):
+            message, length = messages[found], data[p + 12]
+            if length > width:
+                return count, k
+            message["t_ns"], message["id"] = word(data, p, 8, False), word(data, p + 8, 4, False)
+            message["length"], message["fd"] = length, data[p + 13]
+            for b in range(width):
+                message["data"][b] = data[p + _HEAD + b]
+            found += 1
+        message_ends[k] = count = found
+        begin = end
+    return count, ends.shape[0]
 
 
 def _packed_type(width: int) -> np.dtype[np.void]:

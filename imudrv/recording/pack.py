@@ -1,7 +1,6 @@
 """Compress a recording."""
 
 from pathlib import Path
-from typing import NamedTuple
 
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import Writer
@@ -10,22 +9,7 @@ from imudrv.files.atomic import atomic_write
 from imudrv.recording.reader import Recording
 
 
-class Packed(NamedTuple):
-    """Result of `pack`.
-
-    Parameters
-    ----------
-    messages : int
-        Number of messages.
-    cut : bool
-        Whether the recording has no end, as after a power cut; the messages that it has were packed.
-    """
-
-    messages: int
-    cut: bool
-
-
-def pack(source: Path, target: Path) -> Packed:
+def pack(source: Path, target: Path) -> None:
     """Write a recording again, compressed and with an index.
 
     Parameters
@@ -35,23 +19,17 @@ def pack(source: Path, target: Path) -> Packed:
     target : Path
         Its new file, which may be the same one; it appears complete or not at all.
 
-    Returns
-    -------
-    Packed
-
     Raises
     ------
     InputError
         The recording cannot be read or is damaged, or the target cannot be written.
     """
-    recording = Recording(source)
     schemas: dict[int, int] = {0: 0}
     channels: dict[int, int] = {}
-    messages = 0
     with atomic_write(target) as file:
         writer = Writer(file)
         writer.start()
-        for _, record in recording.records():
+        for _, record in Recording(source).records():
             if isinstance(record, Schema):
                 schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
             elif isinstance(record, Channel):
@@ -72,6 +50,4 @@ def pack(source: Path, target: Path) -> Packed:
                     record.publish_time,
                     record.sequence,
                 )
-                messages += 1
         writer.finish()  # type: ignore[no-untyped-call]
-    return Packed(messages, recording.cut)

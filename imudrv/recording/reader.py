@@ -5,11 +5,12 @@ import os
 import struct
 import zlib
 from collections.abc import Callable, Iterator
-from io import BytesIO
+from io import BufferedReader, BytesIO
 from pathlib import Path
 from typing import IO, Any, Final, NamedTuple, TypeAlias
 
 import lz4.frame  # type: ignore[import-untyped]
+import numpy as np
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
@@ -23,15 +24,18 @@ from imudrv.profiles.schema import Profile
 from imudrv.recording.format import (
     CALIBRATION,
     CAN_MESSAGES,
+    CLOCK,
     EVENTS,
     INCREMENTS,
+    MAX_TIME_NS,
     ORIGIN,
     PROFILE,
     STATUS,
     WIRE,
     unpack_messages,
 )
-from imudrv.records import Arrival, Records
+from imudrv.recording.reads import Gatherer, Reads, Recorded
+from imudrv.records import MESSAGE, Arrival, Records, Timebase
 from imudrv.wire.datagram import DatagramDecoder
 
 MAX_RECORD_BYTES: Final = 64 << 20
@@ -49,7 +53,9 @@ _READ: Final[dict[int, Callable[[ReadDataStream], _Record]]] = {
     Opcode.METADATA: Metadata.read,
     Opcode.CHUNK: Chunk.read,
 }
+_NONE: Final = frozenset[int]()
 _LARGE: Final = frozenset({int(Opcode.MESSAGE), int(Opcode.CHUNK)})
+_BUFFER_BYTES: Final = 1 << 18  # thousands of reads, and with all that is made of them within the cache
 
 
 class RecordAt(NamedTuple):
@@ -143,17 +149,41 @@ class Recording:
                 return item.record.metadata
         return {}
 
+    def reads(self) -> Iterator[Reads]:
+        """Yield the reads of the port, many at once.
+
+        Yields
+        ------
+        Reads
+            Whole reads with one timebase.
+
+        Raises
+        ------
+        InputError
+            The file is damaged or cannot be read; what is before the damage comes first.
+        """
+        timebase, gatherer = Timebase(), Gatherer()
+        channels: dict[int, Channel] = {}
+        for offset, item in self._items(gatherer=gatherer):
+            if isinstance(item, Channel):
+                channels[item.id] = item
+                gatherer.add(item)
+            elif isinstance(item, Recorded):
+                yield from self._reads(offset, item, timebase)
+            elif isinstance(item, Message) and channels[item.channel_id].topic == CLOCK:
+                timebase = self._timebase(offset, item.data)
+            elif isinstance(item, Message) and channels[item.channel_id].topic == WIRE:
+                encoding = channels[item.channel_id].message_encoding
+                yield from self._reads(offset, self._one(offset, item, encoding), timebase)
+
     def arrivals(self) -> Iterator[Arrival]:
         """Yield the reads of the port."""
-        for offset, channel, message in self._messages(WIRE):
-            if channel.message_encoding != CAN_MESSAGES:
-                yield Arrival(message.log_time, message.data)
-                continue
-            try:
-                messages = unpack_messages(message.data)
-            except ValueError as error:
-                raise self._corrupt(offset, str(error)) from error
-            yield Arrival(message.log_time, messages)
+        for reads in self.reads():
+            data: bytes | Records = reads.data if reads.data.dtype == MESSAGE else reads.data.tobytes()
+            begin = 0
+            for end, t_ns in zip(reads.ends.tolist(), reads.times.tolist(), strict=True):
+                yield Arrival(t_ns, data[begin:end], reads.timebase)
+                begin = end
 
     def increments(self) -> Iterator[Records]:
         """Yield the published increments, ndarrays of INCREMENTS; counters modulo 2^32."""
@@ -172,15 +202,46 @@ class Recording:
         for t_ns, document in self._documents(EVENTS):
             yield t_ns, str(document.get("text", ""))
 
+    def _one(self, offset: int, message: Message, encoding: str) -> Recorded:
+        """Return the read of one message."""
+        if message.log_time > MAX_TIME_NS:
+            raise self._corrupt(offset, f"expected a time up to {MAX_TIME_NS} ns, got {message.log_time}")
+        data = np.frombuffer(message.data, np.uint8).copy()  # the kernels are compiled for such arrays
+        return Recorded(
+            encoding, data, np.array([data.size]), np.array([message.log_time]), np.zeros(1, np.int64)
+        )
+
+    def _reads(self, offset: int, recorded: Recorded, timebase: Timebase) -> Iterator[Reads]:
+        if recorded.encoding != CAN_MESSAGES:
+            yield Reads(recorded.data, recorded.ends, recorded.times, timebase)
+            return
+        messages, ends, fault = unpack_messages(recorded.data, recorded.ends)
+        yield Reads(messages, ends, recorded.times[: len(ends)], timebase)
+        if fault:
+            raise self._corrupt(offset + int(recorded.places[len(ends)]), fault)
+
     def _documents(self, topic: str) -> Iterator[tuple[int, dict[str, Any]]]:
         for offset, _, message in self._messages(topic):
-            try:
-                document = json.loads(message.data)
-            except (ValueError, RecursionError) as error:
-                raise self._corrupt(offset, f"expected JSON: {error}") from error
-            if not isinstance(document, dict):
-                raise self._corrupt(offset, "expected a JSON object")
-            yield message.log_time, document
+            yield message.log_time, self._document(offset, message.data)
+
+    def _document(self, offset: int, data: bytes) -> dict[str, Any]:
+        try:
+            document = json.loads(data)
+        except (ValueError, RecursionError) as error:
+            raise self._corrupt(offset, f"expected JSON: {error}") from error
+        if not isinstance(document, dict):
+            raise self._corrupt(offset, "expected a JSON object")
+        return document
+
+    def _timebase(self, offset: int, data: bytes) -> Timebase:
+        document = self._document(offset, data)
+        values = map(document.get, Timebase._fields)
+        times = [value for value in values if type(value) is int and abs(value) <= MAX_TIME_NS]
+        if len(times) != len(Timebase._fields):
+            raise self._corrupt(
+                offset, f"expected {', '.join(Timebase._fields)}, each up to {MAX_TIME_NS} ns"
+            )
+        return Timebase(*times)
 
     def _attachments(self, name: str) -> Iterator[tuple[int, str]]:
         for offset, record in self.records(skip_messages=True):
@@ -190,14 +251,14 @@ class Recording:
                 except UnicodeDecodeError as error:
                     raise self._corrupt(offset, "expected text") from error
 
-    def _messages(self, topic: str) -> Iterator[tuple[int, Channel, Message]]:
+    def _messages(self, *topics: str) -> Iterator[tuple[int, Channel, Message]]:
         channels: dict[int, Channel] = {}
         for offset, record in self.records():
             if isinstance(record, Channel):
                 channels[record.id] = record
             elif isinstance(record, Message):
                 channel = channels[record.channel_id]
-                if channel.topic == topic:
+                if channel.topic in topics:
                     yield offset, channel, record
 
     def records(self, skip_messages: bool = False) -> Iterator[RecordAt]:
@@ -217,27 +278,47 @@ class Recording:
         InputError
             The file is damaged or cannot be read.
         """
-        skipped = _LARGE if skip_messages else frozenset[int]()
+        for offset, item in self._items(_LARGE if skip_messages else _NONE):
+            if not isinstance(item, Recorded):
+                yield RecordAt(offset, item)
+
+    def _items(
+        self, skipped: frozenset[int] = _NONE, gatherer: Gatherer | None = None
+    ) -> Iterator[tuple[int, _Record | Recorded]]:
+        """Yield the records outside and inside of chunks, and the reads that a gatherer takes."""
         channels: set[int] = set()
         try:
-            with self.path.open("rb") as file:
+            with BufferedReader(self.path.open("rb", 0), _BUFFER_BYTES) as file:
                 file.seek(len(MCAP0_MAGIC))
-                for item in self._records_of(file, skipped, channels):
-                    if not isinstance(item.record, Chunk):
-                        yield item
+                for offset, item in self._items_of(file, skipped, channels, gatherer):
+                    if not isinstance(item, Chunk):
+                        yield offset, item
                         continue
-                    inside = BytesIO(self._unpacked(item.record, item.offset))
-                    for offset, record in self._records_of(inside, skipped, channels):
+                    chunk = BufferedReader(BytesIO(self._unpacked(item, offset)), _BUFFER_BYTES)
+                    for inside, record in self._items_of(chunk, skipped, channels, gatherer):
                         if isinstance(record, Chunk):
-                            raise self._corrupt(item.offset, "expected no chunk inside of a chunk")
+                            raise self._corrupt(offset, "expected no chunk inside of a chunk")
                         # Approximate: an offset inside refers to the unpacked chunk.
-                        yield RecordAt(item.offset + offset, record)
+                        yield offset + inside, record
         except OSError as error:
             raise InputError(f"{self.path}: cannot be read on: {error.strerror or error}") from error
 
-    def _records_of(self, file: IO[bytes], skipped: frozenset[int], channels: set[int]) -> Iterator[RecordAt]:
+    def _items_of(
+        self,
+        file: "BufferedReader[Any]",
+        skipped: frozenset[int],
+        channels: set[int],
+        gatherer: Gatherer | None,
+    ) -> Iterator[tuple[int, _Record | Recorded]]:
         while True:
             offset = file.tell()
+            if gatherer is not None:
+                size, recorded = gatherer.gather(file.peek())
+                if size:
+                    file.seek(size, 1)
+                    if recorded.ends.size:
+                        yield offset, recorded
+                    continue
             head = file.read(_RECORD.size)
             if len(head) < _RECORD.size:
                 return
@@ -257,7 +338,7 @@ class Recording:
                 channels.add(record.id)
             elif isinstance(record, Message) and record.channel_id not in channels:
                 raise self._corrupt(offset, f"expected a known channel, got {record.channel_id}")
-            yield RecordAt(offset, record)
+            yield offset, record
 
     def _parsed(self, opcode: int, body: bytes, offset: int) -> _Record:
         try:

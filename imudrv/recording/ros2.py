@@ -1,6 +1,6 @@
 """Export to sensor_msgs/Imu in an MCAP file for ROS 2."""
 
-from collections.abc import Iterator
+from math import isnan
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,7 +10,6 @@ from imudrv.errors import InputError
 from imudrv.files.atomic import atomic_write
 from imudrv.recording.format import ORIGIN
 from imudrv.recording.reader import Recording
-from imudrv.records import Records
 from imudrv.units import NS, NS_PER_S
 
 TOPIC: Final = "/imu/data_raw"
@@ -45,15 +44,13 @@ float64 z
 """
 
 
-def export_ros2(recording: Recording, pieces: Iterator[Records], target: Path) -> None:
-    """Write increments as rates and specific forces, one message a sample.
+def export_ros2(recording: Recording, target: Path) -> None:
+    """Write the increments of a recording as rates and specific forces, one message a sample.
 
     Parameters
     ----------
     recording : Recording
-        Source of the metadata.
-    pieces : iterator of ndarray of INCREMENTS
-        The increments, body axes.
+        The recording.
     target : Path
         The file.
 
@@ -73,7 +70,7 @@ def export_ros2(recording: Recording, pieces: Iterator[Records], target: Path) -
         writer = Writer(file)
         schema = writer.register_msgdef("sensor_msgs/msg/Imu", _IMU_DEFINITION)
         writer.add_metadata(ORIGIN, recording.origin)
-        for increments in pieces:
+        for increments in recording.increments():
             if (increments["interval_ns"] <= 0).any() or (increments["t_ns"] < 0).any():
                 raise InputError(
                     f"{recording.path}: expected samples with an interval and a time from 1970 on, got others"
@@ -93,7 +90,12 @@ def _imu_message(t_ns: int, rate: list[float], force: list[float]) -> dict[str, 
         "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
         "orientation_covariance": [-1.0] + [0.0] * 8,  # there is no orientation
         "angular_velocity": dict(zip("xyz", rate, strict=True)),
-        "angular_velocity_covariance": [0.0] * 9,  # not known
+        "angular_velocity_covariance": _covariance(rate),
         "linear_acceleration": dict(zip("xyz", force, strict=True)),
-        "linear_acceleration_covariance": [0.0] * 9,
+        "linear_acceleration_covariance": _covariance(force),
     }
+
+
+def _covariance(values: list[float]) -> list[float]:
+    """Return a covariance that is not known: 0, or -1 first for a sensor that the unit lacks."""
+    return [-1.0 if all(map(isnan, values)) else 0.0] + [0.0] * 8

@@ -6,7 +6,6 @@ X Y Z in m/s, here increments. Time is UTC, which the header says, and restarts 
 error of one increment is added to the next, so that sums are right to one unit.
 """
 
-from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
 from typing import Final
@@ -51,15 +50,13 @@ _WEEK_NS: Final = 7 * 86_400 * NS_PER_S
 _SUNDAY_NS: Final = 4 * 86_400 * NS_PER_S  # the epoch was a Thursday, weeks begin on Sunday
 
 
-def export_imr(recording: Recording, pieces: Iterator[Records], target: Path) -> None:
-    """Write increments as IMR.
+def export_imr(recording: Recording, target: Path) -> None:
+    """Write the increments of a recording as IMR.
 
     Parameters
     ----------
     recording : Recording
-        Source of the header.
-    pieces : iterator of ndarray of INCREMENTS
-        The increments, body axes.
+        The recording.
     target : Path
         The file.
 
@@ -73,7 +70,7 @@ def export_imr(recording: Recording, pieces: Iterator[Records], target: Path) ->
     header["szHeader"] = b"$IMURAW"
     header["dVersionNumber"] = 8.80
     header["bDeltaTheta"] = header["bDeltaVelocity"] = 1
-    header["dDataRateHz"] = recording.profile.sample_rate_hz
+    header["dDataRateHz"] = recording.profile.rate_hz
     header["dGyroScaleFactor"] = _GYRO_DEG
     header["dAccelScaleFactor"] = _ACCELEROMETER_M_S
     header["iUtcOrGpsTime"] = 1
@@ -83,7 +80,7 @@ def export_imr(recording: Recording, pieces: Iterator[Records], target: Path) ->
     accelerometer = _Rounding("velocity", "m/s", _ACCELEROMETER_M_S)
     with atomic_write(target) as file:
         file.write(header.tobytes())
-        for increments in pieces:
+        for increments in recording.increments():
             samples = np.zeros(increments.size, _SAMPLE)
             samples["time"] = ((increments["t_ns"] + _SUNDAY_NS) % _WEEK_NS) * NS
             samples["gyro"] = gyro.feed(increments["dtheta_b"] / DEG, increments)
@@ -101,6 +98,11 @@ class _Rounding:
         self._remainder = np.zeros(3)
 
     def feed(self, values: NDArray[np.float64], increments: Records) -> NDArray[np.float64]:
+        if np.isnan(values).any():
+            raise InputError(
+                f"expected {self._name} increments of all three axes, as the format has no place for an "
+                "absent one, got those of a unit that lacks some; export to csv or npz"
+            )
         sums = self._remainder + np.cumsum(values / self._scale, axis=0)
         whole = np.rint(sums)
         self._remainder = sums[-1] - whole[-1]

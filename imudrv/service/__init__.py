@@ -2,6 +2,7 @@
 
 loop               read, decode, compensate, publish
 port               supervision of the port
+clock_watch        steps of the host's clock, and suspends
 calibration_watch  replacement of the calibration when its file changes
 recordings         recordings, begun and ended while running
 events             event log

@@ -20,10 +20,12 @@ class EventLog:
     record : callable
         Called with the time (ns) and the text of each event.
     clock : callable
-        Returns the host time, ns.
+        Returns the time on the scale of the arrivals, ns.
 
     Attributes
     ----------
+    offset_ns : int
+        UNIX time less the time of the clock.
     is_new : bool
         Whether there is something to publish: at first, and after each event until it is cleared.
     """
@@ -37,6 +39,7 @@ class EventLog:
     ) -> None:
         self._say, self._warn, self._record, self._clock = say, warn, record, clock
         self._lines: deque[str] = deque(maxlen=_KEPT)
+        self.offset_ns = 0
         self.is_new = True
 
     @property
@@ -54,7 +57,7 @@ class EventLog:
 
     def _log(self, text: str, say: Callable[[str], None]) -> None:
         now = self._clock()
-        time = datetime.fromtimestamp(now * NS, UTC).isoformat(timespec="milliseconds")
+        time = datetime.fromtimestamp((now + self.offset_ns) * NS, UTC).isoformat(timespec="milliseconds")
         self._lines.append(f"{time.replace('+00:00', 'Z')} {text}")
         self.is_new = True
         say(self._lines[-1])

@@ -22,11 +22,11 @@ from imudrv import profiles
 from imudrv.calibration import coefficients
 from imudrv.diagnosis import LineState
 from imudrv.hostclock import now_ns
-from imudrv.imu.rate_filter import rate_filter
 from imudrv.pipeline import Pipeline, PipelineOutput
 from imudrv.ports import PortEndedError
-from imudrv.records import INCREMENTS, PULSES, Arrival, Source
+from imudrv.records import INCREMENTS, PULSES, Arrival, Flag, Source
 from imudrv.service.calibration_watch import CalibrationWatch
+from imudrv.service.clock_watch import ClockWatch
 from imudrv.service.events import EventLog
 from imudrv.service.latency import Latency
 from imudrv.service.port import PortSupervisor
@@ -52,6 +52,7 @@ from imudrv.wire.datagram import encode
 
 POLL_NS: Final = NS_PER_S // 50
 """Time between two rounds of housekeeping, and the longest wait for data."""
+_INVALID: Final = np.uint32(~Flag.VALID & 0xFFFF_FFFF)
 
 
 class Service:
@@ -76,7 +77,9 @@ class Service:
     notices : callable, optional
         Returns further warnings for the status, a sentence each.
     clock : callable, optional
-        Returns the host time, ns.
+        Returns the time on the scale of the arrivals, ns.
+    clock_watch : ClockWatch, optional
+        Watch of the host's real-time clock.
 
     Raises
     ------
@@ -96,20 +99,25 @@ class Service:
         signals: SignalFlags | None = None,
         notices: Callable[[], list[str]] = list,
         clock: Callable[[], int] = now_ns,
+        clock_watch: ClockWatch | None = None,
     ) -> None:
         self._settings, self._clock = settings, clock
+        self._in_real_time = in_real_time
+        self._clock_watch = clock_watch or ClockWatch()
         self._version = version("imu50")  # reads files: not in the loop
         self._profile_file = profiles.load_file(settings.profile)
         self._profile = self._profile_file.model
         self._layout = self._profile.layout()
         self._recordings = Recordings(self._create_recorder, history)
         self._events = EventLog(say, warn or say, self._recordings.event, clock)
-        self._calibration = CalibrationWatch(Path(settings.calibration), settings.unit, self._events)
+        self._calibration = CalibrationWatch(
+            Path(settings.calibration), settings.unit, self._layout, self._events
+        )
         self._port = PortSupervisor(settings.port, self._profile, in_real_time, self._events, clock)
         self._pipeline = Pipeline(
             self._profile,
             coefficients(self._calibration.current.model),
-            rate_filter(settings.rate_filter, self._layout.interval_ns),
+            settings.rate_filter,
         )
         self._latency = Latency(self._layout.interval_ns)
         self._signals = signals or SignalFlags()
@@ -171,7 +179,12 @@ class Service:
             arrival = self._port.read(POLL_NS * NS)
         except PortEndedError:
             return False
+        if step := self._clock_watch.poll():
+            self._events.offset_ns = self._clock_watch.timebase.offset_ns
+            self._events.event(step)
         if arrival is not None:
+            if self._port.source is not Source.REPLAY:
+                arrival = Arrival(arrival.t_ns, arrival.data, self._clock_watch.timebase)
             self._process(arrival)
         now = self._clock()
         if now >= self._next_poll_ns:
@@ -223,15 +236,21 @@ class Service:
         return self._recordings.request(path, since)
 
     def _process(self, arrival: Arrival) -> None:
+        read_ns = arrival.t_ns
+        if not self._in_real_time:
+            arrival = arrival._replace(t_ns=0)  # when it came tells nothing about its samples
         self._recordings.arrived(arrival)
+        self._pipeline.clock.follow(arrival.timebase)
         output = self._pipeline.feed(arrival.data, arrival.t_ns)
-        self._publish(output, arrival.t_ns)
+        self._publish(output, read_ns)
         self._port.decoded(arrival, len(output.pulses))
 
     def _publish(self, output: PipelineOutput, arrival_ns: int) -> None:
         pulses, increments = output
         if not len(pulses) and not len(increments):
             return
+        if self._port.state.name == "wrong rate":
+            increments["flags"] &= _INVALID  # they do not cover the interval that they name
         batch = Batch(pulses, increments, encode(increments, self._port.source))
         for sink in self._sinks:
             sink.publish(batch)
@@ -278,7 +297,7 @@ class Service:
         self._rate_hz = (self._samples - self._rated_samples) / ((now - self._rated_ns) * NS)
         self._lost_last_s = counts.lost - self._rated_lost
         self._rated_samples, self._rated_lost, self._rated_ns = self._samples, counts.lost, now
-        self._port.check_rate(counts.expected, now)
+        self._port.check_rate(counts.expected, self._lost_last_s, now)
 
     def _assemble_status(self, now: int) -> Status:
         calibration, pipeline = self._calibration, self._pipeline
@@ -286,14 +305,14 @@ class Service:
         return Status(
             software=self._version,
             pid=os.getpid(),
-            t_ns=now,
+            t_ns=now + self._clock_watch.timebase.offset_ns,
             uptime_s=(now - self._started_ns) * NS,
             port=self._port.status,
             profile=self._profile.name,
             unit=calibration.current.model.serial_number,
             calibration=calibration.status,
             rate_hz=self._rate_hz,
-            nominal_rate_hz=self._profile.sample_rate_hz,
+            nominal_rate_hz=self._profile.rate_hz,
             samples=SampleStatus(**vars(pipeline.tracker.counts), lost_last_s=self._lost_last_s),
             rejected={
                 reason.name.lower(): RejectedStatus(entry.runs, entry.length)

@@ -97,7 +97,8 @@ def _time_rows(status: Status) -> Iterator[Row]:
     clock, latency = status.clock, status.latency
     locked = "locked" if clock.locked else "not locked"
     skew = "unknown" if clock.skew_ppm is None else f"{clock.skew_ppm:+.2f} ppm"
-    yield "clock", f"{locked}, skew {skew}, worst {clock.worst_s:.3f} s", ""
+    steps = f", stepped {clock.steps} times" if clock.steps else ""
+    yield "clock", f"{locked}, skew {skew}, worst {clock.worst_s:.3f} s{steps}", ""
     names = [f"<{edge * 1e3:g}" for edge in STALL_EDGES_S] + [f">={STALL_EDGES_S[-1] * 1e3:g}"]
     stalls = [f"{n} {name}" for name, n in zip(names, clock.stalls, strict=True) if n]
     yield "stalls", f"{', '.join(stalls)} ms" if stalls else "none", ""

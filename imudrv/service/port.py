@@ -6,11 +6,16 @@ from typing import Final
 
 from imudrv.diagnosis import LineState, LineWatch
 from imudrv.ports import Port, PortEndedError, PortLostError, check_url, open_port
+from imudrv.ports.base import LineErrors
+from imudrv.ports.holders import holders
 from imudrv.profiles.schema import Profile
 from imudrv.records import Arrival, Source
+from imudrv.service.background import Background
 from imudrv.service.events import EventLog
+from imudrv.service.mismatch_search import MismatchSearch
 from imudrv.service.status import PortStatus
 from imudrv.units import NS_PER_S
+from imudrv.url import split
 
 BACK_OFF_S: Final = (0.1, 0.2, 0.4, 0.8)
 """Delays before further attempts to open the port; the last one is repeated."""
@@ -58,13 +63,18 @@ class PortSupervisor:
         self.state = LineState("connecting")
         self._port: Port | None = None
         self._watch = LineWatch(profile, self._in_real_time, clock())
+        self._search = MismatchSearch(profile)
+        self._device = split(url).device
+        self._user_search = Background[list[str]]()
+        self._users: list[str] = []
+        self._errors = LineErrors()  # counted by the driver while the data was good
         self._reconnects = 0
         self._attempts, self._next_attempt_ns = 0, 0
 
     @property
     def status(self) -> PortStatus:
         """Current status of the port."""
-        return PortStatus(self._url, *self.state, self._reconnects, self.source.name.lower())
+        return PortStatus(self._url, *self.state, self._users, self._reconnects, self.source.name.lower())
 
     def read(self, timeout_s: float) -> Arrival | None:
         """Wait for data.
@@ -102,23 +112,55 @@ class PortSupervisor:
 
     def decoded(self, arrival: Arrival, samples: int) -> None:
         """Take note of the number of samples that an arrival completed."""
-        self._watch.arrived(len(arrival.data), samples, self._clock())
+        self._watch.arrived(arrival.data, samples, self._clock())
 
-    def check_rate(self, expected: int, now_ns: int) -> None:
-        """Check the rate; call it about once a second with the number of samples by the unit's counter."""
-        if self._port is not None:
-            self._watch.counted(expected, now_ns)
+    def check_rate(self, expected: int, lost: int, now_ns: int) -> None:
+        """Check the rate, and after losses which other programs have the port open; call it once a second.
 
-    def check_line(self, now_ns: int) -> None:
-        """Report a line that has become silent, unreadable or good again."""
+        Parameters
+        ----------
+        expected : int
+            Number of samples by the unit's counter.
+        lost : int
+            Number of samples lost since the last call.
+        now_ns : int
+            Present time.
+        """
         if self._port is None:
             return
-        before, self.state = self.state, self._watch.state(now_ns)
-        if self.state == before:
+        self._watch.counted(expected, now_ns)
+        if self.state.name == "streaming":
+            self._errors = self._port.line_errors()
+        if lost or self._users or self.state.name == "unreadable":
+            self._check_users(now_ns)
+
+    def _check_users(self, now_ns: int) -> None:
+        if self._device is None:
             return
-        if self.state.trouble:
-            self._events.failure(str(self.state))
-        elif before.name == "streaming":
+        before, device = self._users, self._device
+        self._users = self._user_search.poll(now_ns, lambda: holders(device.resolve())[0]) or []
+        if self._users and self._users != before:
+            self._events.failure(
+                f"port also open in {', '.join(self._users)}: each program receives only a part of the data"
+            )
+
+    def check_line(self, now_ns: int) -> None:
+        """Report a line that has become silent, unreadable or good again, or whose rate is wrong."""
+        if self._port is None:
+            return
+        before, state = self.state, self._watch.state(now_ns)
+        if state.name == "unreadable":
+            errors = self._port.line_errors().since(self._errors)
+            reason = self._search.poll(now_ns, self._watch.undecoded, errors)
+            state = state._replace(trouble=f"{state.trouble}: {reason}")
+        elif before.name == "unreadable":
+            self._search.clear()
+        self.state = state
+        if state == before:
+            return
+        if state.trouble:
+            self._events.failure(str(state))
+        elif before.name == "wrong rate":
             self._events.event("the rate is right again")
         else:
             self._events.event("the unit is back")
@@ -148,4 +190,8 @@ class PortSupervisor:
             self._events.event("port is back")
         self.state = LineState("streaming")
         self._watch = LineWatch(self._profile, self._in_real_time, self._clock())
+        self._search.clear()
+        self._user_search.clear()
+        self._users = []
+        self._errors = self._port.line_errors()
         return self._port

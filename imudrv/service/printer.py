@@ -6,11 +6,11 @@ A stopped terminal (Ctrl-S), a pipe that nobody reads and a full disk then stop 
 import os
 import select
 import time
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from queue import Empty, Full, Queue
 from threading import Thread
 from types import TracebackType
-from typing import Final, Self, TextIO
+from typing import Final, TextIO
 
 LIMIT: Final = 1000
 """Maximum number of lines in the queue."""
@@ -23,7 +23,7 @@ STOPPED_S: Final = 1.0
 _LAST_S: Final = 1.0
 
 
-class Printer:
+class Printer(AbstractContextManager["Printer"]):
     """Prints lines in the background.
 
     `say` neither blocks nor raises. The oldest lines of a full queue, and lines that cannot be written, are
@@ -96,9 +96,6 @@ class Printer:
         except Full:
             return
         self._thread.join(_LAST_S)
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None

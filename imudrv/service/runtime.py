@@ -7,8 +7,10 @@ import resource
 import signal
 import socket
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Final
+
+from imudrv.signals import handled
 
 PRIORITY: Final = 40
 """SCHED_FIFO priority: above ordinary work, below the kernel's interrupt threads (50)."""
@@ -79,15 +81,9 @@ class SignalFlags:
             self.stop = True
             self.hung_up = number == signal.SIGHUP
 
-    @contextmanager
-    def caught(self, *numbers: signal.Signals) -> Iterator[None]:
+    def caught(self, *numbers: signal.Signals) -> AbstractContextManager[None]:
         """Handle these signals within the context."""
-        before = {number: signal.signal(number, self._handle) for number in numbers}
-        try:
-            yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
+        return handled(self._handle, *numbers)
 
 
 class SystemdNotifier:

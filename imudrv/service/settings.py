@@ -1,7 +1,7 @@
 """Settings of the live service: from a file, from the command line, or from both."""
 
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field as Key
 
@@ -11,9 +11,6 @@ from imudrv.files.settings_file import parse, read
 from imudrv.imu.rate_filter import RateFilterName
 
 Text = Annotated[str, Key(min_length=1, max_length=4096)]
-
-
-FORMAT: Final = "imu50-service"
 
 
 class Settings(Model):

@@ -26,6 +26,8 @@ class PortStatus:
         As in the settings.
     state, trouble : str
         Fields of `imudrv.diagnosis.LineState`.
+    users : list of str
+        Other programs that have the port open; looked for after losses only.
     reconnects : int
         Number of times that a lost port was opened again.
     source : str
@@ -35,6 +37,7 @@ class PortStatus:
     url: str
     state: str
     trouble: str
+    users: list[str]
     reconnects: int
     source: str
 
@@ -78,7 +81,7 @@ class RejectedStatus:
 
 @dataclass(frozen=True)
 class UnitStatus:
-    """Status word of the latest sample, and the names of its bits that are set and that mean a fault."""
+    """Status word of the latest sample, and the names of its bits that apply and that mean a fault."""
 
     word: int
     bits: list[str]
@@ -87,8 +90,8 @@ class UnitStatus:
     @classmethod
     def of(cls, word: int, layout: Layout) -> Self:
         """Name the bits of a status word."""
-        bits = [(1 << bit, name) for bit, name in layout.status_names if word >> bit & 1]
-        return cls(word, [name for _, name in bits], [n for mask, n in bits if mask & layout.status.fault])
+        bits = layout.active_bits(word)
+        return cls(word, list(bits.values()), [n for mask, n in bits.items() if mask & layout.status.fault])
 
 
 @dataclass(frozen=True)
@@ -177,7 +180,7 @@ class Status:
 
     @property
     def failures(self) -> list[str]:
-        """Reasons why no samples are output or recorded."""
+        """Reasons why no valid samples are output, or none are recorded."""
         failures = []
         if self.port.state not in ("streaming", "ended"):
             failures.append(f"port {self.port.state}: {self.port.trouble or self.port.url}")
@@ -190,13 +193,13 @@ class Status:
     @property
     def warnings(self) -> list[str]:
         """What a person should look at although samples are output."""
-        is_streaming = self.port.state == "streaming"
-        warnings = [self.port.trouble] if is_streaming and self.port.trouble else []
-        warnings += [f"unit: {name}" for name in self.unit_status.faults]
+        warnings = [f"unit: {name}" for name in self.unit_status.faults]
         warnings += [f"{sink.url}: {sink.state}" for sink in self.sinks if not sink.healthy]
+        if self.port.users:
+            warnings.append(f"port also open in {', '.join(self.port.users)}")
         if self.samples.lost_last_s:
             warnings.append(f"{self.samples.lost_last_s} samples lost in the last second")
-        if is_streaming and not self.clock.locked:
+        if self.port.state == "streaming" and not self.clock.locked:
             warnings.append("clock not locked yet")
         return warnings + self.notices
 

@@ -52,15 +52,14 @@ class StatusServer:
                     )
             path.unlink()
         self._socket = socket.socket(socket.AF_UNIX)
+        before = os.umask(0o177)
         try:
-            before = os.umask(0o177)
-            try:
-                self._socket.bind(os.fspath(path))
-            finally:
-                os.umask(before)
+            self._socket.bind(os.fspath(path))
         except OSError as error:
             self._socket.close()
             raise InputError(f"{path}: cannot create the status socket: {error.strerror or error}") from error
+        finally:
+            os.umask(before)
         self._socket.listen(8)
         self._socket.setblocking(False)
 

@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 
 from imudrv.calibration import Calibration, coefficients
-from imudrv.imu.rate_filter import RateFilterName, rate_filter
+from imudrv.imu.rate_filter import RateFilterName
 from imudrv.pipeline import Pipeline
 from imudrv.profiles.schema import Profile
 from imudrv.records import PULSES, Source
@@ -17,14 +17,13 @@ _SAMPLES: Final = 300
 _PIECES: Final = 50
 
 
-def warm_up(profile: Profile, calibration: Calibration, rate_filter_name: RateFilterName) -> None:
+def warm_up(profile: Profile, calibration: Calibration, rate_filter: RateFilterName) -> None:
     """Send made-up samples through every stage, including a replacement of the calibration."""
     layout = profile.layout()
     pulses = np.zeros(_SAMPLES, PULSES)
-    pulses["counter"] = np.arange(_SAMPLES)
+    pulses["counter"] = layout.counter_step * np.arange(_SAMPLES)
     pulses["temperature_degc"] = 35.0
-    rates = rate_filter(rate_filter_name, layout.interval_ns)
-    pipeline = Pipeline(profile, coefficients(calibration), rates)
+    pipeline = Pipeline(profile, coefficients(calibration), rate_filter)
     wire = CanEncoder(layout).encode(pulses) if layout.can else StreamEncoder(layout).encode(pulses).tobytes()
     piece = max(1, len(wire) // _PIECES)
     for at in range(0, len(wire), piece):

@@ -42,7 +42,7 @@ def wire(scenario: Scenario, layout: Layout, chunk: int = 65_536) -> Iterator[Wi
     Parameters
     ----------
     scenario : Scenario
-        Scenario. Pulses beyond the range of the wire saturate.
+        Scenario.
     layout : Layout
         Layout of the profile.
     chunk : int
@@ -53,17 +53,17 @@ def wire(scenario: Scenario, layout: Layout, chunk: int = 65_536) -> Iterator[Wi
     WireChunk
         Data of `chunk` samples.
     """
-    chunks = simulate(_within(scenario, layout), layout.interval_ns, chunk)
+    chunks = simulate(scenario, layout, chunk)
     if layout.can:
-        encoder, bus = CanEncoder(layout), MessageFaults(scenario.faults, scenario.seed)
+        messages, bus = CanEncoder(layout), MessageFaults(scenario.faults, scenario.seed)
         for part in chunks:
-            yield _messages(bus.apply(encoder.encode(part.pulses))[0], part.truth)
+            yield _messages(bus.apply(messages.encode(part.pulses))[0], part.truth)
         yield _messages(bus.close()[0], np.zeros(0, TRUTH))
         return
-    header = bytes(value for _, value in layout.messages[0].constants)
-    frames, line = StreamEncoder(layout), StreamFaults(scenario.faults, header, scenario.seed)
+    kinds = [(message.length, message.header) for message in layout.messages if message.is_part]
+    frames, line = StreamEncoder(layout), StreamFaults(scenario.faults, kinds, scenario.seed)
     for part in chunks:
-        t_ns = part.pulses["arrival_ns"]
+        t_ns = np.repeat(part.pulses["arrival_ns"], len(kinds))
         data, damage = line.apply(frames.encode(part.pulses), t_ns)
         yield WireChunk(data, t_ns, np.cumsum(damage.size), part.truth)
 
@@ -90,14 +90,3 @@ def record(scenario: Scenario, layout: Layout) -> Iterator[tuple[bytes, Records]
 
 def _messages(messages: Records, truth: Records) -> WireChunk:
     return WireChunk(messages, messages["t_ns"], np.arange(1, messages.size + 1), truth)
-
-
-def _within(scenario: Scenario, layout: Layout) -> Scenario:
-    limits = scenario.unit.saturation
-    narrowed = limits.model_copy(
-        update={
-            "gyro_pulses": min(limits.gyro_pulses, layout.pulse_limit),
-            "accelerometer_pulses": min(limits.accelerometer_pulses, layout.pulse_limit),
-        }
-    )
-    return scenario.model_copy(update={"unit": scenario.unit.model_copy(update={"saturation": narrowed})})

@@ -11,7 +11,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from imudrv.errors import InputError
 from imudrv.records import MESSAGE, Records
 from imudrv.sim.scenario import Faults, Silence
 from imudrv.units import NS
@@ -75,40 +74,34 @@ class StreamFaults:
     ----------
     faults : Faults
         Faults of the scenario; `stream`, `silences` and `unplugs` are used.
-    header : bytes
-        First bytes of every frame, for false syncs.
+    kinds : sequence of (int, bytes)
+        Length and first bytes of the frames of a sample, in their order; the bytes are used for false syncs.
     seed : int
         Same seed, same faults.
     """
 
-    def __init__(self, faults: Faults, header: bytes, seed: int) -> None:
+    def __init__(self, faults: Faults, kinds: Sequence[tuple[int, bytes]], seed: int) -> None:
         rates = faults.stream
-        self._odds = (
-            (Kind.BIT_FLIPS, rates.bit_flips),
-            (Kind.BYTES_LOST, rates.bytes_lost),
-            (Kind.BYTES_INSERTED, rates.bytes_inserted),
-            (Kind.FALSE_SYNC_INSIDE, rates.false_sync_inside),
-            (Kind.LOST, rates.frame_lost),
-            (Kind.BYTES_BETWEEN, rates.bytes_between),
-            (Kind.FALSE_SYNC_BETWEEN, rates.false_sync_between),
-            (Kind.DOUBLED, rates.frame_doubled),
+        header = kinds[0][1]
+        table: tuple[tuple[Kind, float, Callable[[bytes], bytes]], ...] = (
+            (Kind.BIT_FLIPS, rates.bit_flips, self._flip),
+            (Kind.BYTES_LOST, rates.bytes_lost, self._lose),
+            (Kind.BYTES_INSERTED, rates.bytes_inserted, lambda frame: self._insert(frame, self._random())),
+            (Kind.FALSE_SYNC_INSIDE, rates.false_sync_inside, lambda frame: self._insert(frame, header)),
+            (Kind.LOST, rates.frame_lost, lambda frame: b""),
+            (Kind.BYTES_BETWEEN, rates.bytes_between, lambda frame: self._random() + frame),
+            (Kind.FALSE_SYNC_BETWEEN, rates.false_sync_between, lambda frame: header + frame),
+            (Kind.DOUBLED, rates.frame_doubled, lambda frame: frame + frame),
         )
+        self._odds = [(kind, rate) for kind, rate, _ in table]
+        self._act: dict[Kind, Callable[[bytes], bytes]] = {kind: act for kind, _, act in table}
+        self._act[Kind.SILENCE] = lambda frame: b""
         self._silences = faults.silences + faults.unplugs
-        self._header = header
+        self._lengths = [length for length, _ in kinds]
+        self._next_headers = [kinds[(k + 1) % len(kinds)][1] for k in range(len(kinds))]
         # separate generators for kind and details: chunks of any size draw the same
         self._draw = _generator(seed, 5)
         self._rng = _generator(seed, 6)
-        self._act: dict[Kind, Callable[[bytes], bytes]] = {
-            Kind.BIT_FLIPS: self._flip,
-            Kind.BYTES_LOST: self._lose,
-            Kind.BYTES_INSERTED: lambda frame: self._insert(frame, self._random()),
-            Kind.FALSE_SYNC_INSIDE: lambda frame: self._insert(frame, header),
-            Kind.LOST: lambda frame: b"",
-            Kind.BYTES_BETWEEN: lambda frame: self._random() + frame,
-            Kind.FALSE_SYNC_BETWEEN: lambda frame: header + frame,
-            Kind.DOUBLED: lambda frame: frame + frame,
-            Kind.SILENCE: lambda frame: b"",
-        }
 
     def apply(self, frames: Bytes, t_ns: NDArray[np.int64]) -> tuple[bytes, Damage]:
         """Apply the faults to frames.
@@ -116,9 +109,9 @@ class StreamFaults:
         Parameters
         ----------
         frames : ndarray of uint8, shape (n, length)
-            One frame per row.
-        t_ns : ndarray of int64, shape (n,)
-            Time of each since the start of the run.
+            The frames of one sample per row.
+        t_ns : ndarray of int64, shape (m,)
+            Time of each frame since the start of the run.
 
         Returns
         -------
@@ -126,34 +119,26 @@ class StreamFaults:
             Bytes that arrive.
         Damage
             One row per frame.
-
-        Raises
-        ------
-        InputError
-            Numbers of times and frames differ, or frames are shorter than 2 bytes.
         """
-        n, length = frames.shape
-        if t_ns.shape != (n,) or length < 2:
-            raise InputError(
-                "faults: expected n frames of 2 bytes or more and n times, "
-                f"got shapes {frames.shape} and {t_ns.shape}"
-            )
         kind = _kinds(self._odds, self._silences, t_ns, self._draw)
-        size = np.full(n, length)
+        size = np.tile(self._lengths, len(frames))
+        ends = np.cumsum(size)
+        sent = frames.tobytes()
         pieces = []
         done = 0
         for i in np.flatnonzero(kind).tolist():
-            frame = frames[i].tobytes()
-            arrives = self._damaged(Kind(kind[i]), frame)
+            begin, end = int(ends[i] - size[i]), int(ends[i])
+            frame = sent[begin:end]
+            arrives = self._damaged(Kind(kind[i]), frame, self._next_headers[i % len(self._lengths)])
             if arrives == frame:
                 kind[i] = Kind.NONE
             size[i] = len(arrives)
-            pieces += [frames[done:i].tobytes(), arrives]
-            done = i + 1
-        pieces.append(frames[done:].tobytes())
+            pieces += [sent[done:begin], arrives]
+            done = end
+        pieces.append(sent[done:])
         return b"".join(pieces), _damage(kind, size)
 
-    def _damaged(self, kind: Kind, frame: bytes) -> bytes:
+    def _damaged(self, kind: Kind, frame: bytes, next_header: bytes) -> bytes:
         """Damage a frame; keep it whole if it stays readable after several attempts."""
         act = self._act[kind]
         if kind not in _HARM:
@@ -161,7 +146,7 @@ class StreamFaults:
         for _ in range(_TRIES):
             arrives = act(frame)
             # lost last bytes may be equal to the header of the next frame
-            if frame not in arrives + self._header[: len(frame) - 1]:
+            if frame not in arrives + next_header[: len(frame) - 1]:
                 return arrives
         return frame
 

@@ -40,7 +40,6 @@ from imudrv.sim.path import (
     still,
 )
 from imudrv.sim.scenario import Scenario
-from imudrv.units import NS
 from imudrv.vectors import Vector, add, cross, dot, row, scale
 
 _NO_END: Final = 2**62
@@ -89,8 +88,6 @@ class Motion:
         Start, motion and seed are used.
     body : Body
         The unit and the place; its `interval_s` is the sample interval.
-    interval_ns : int
-        The sample interval.
     split_s : float
         Time from the start of an interval at which `Integrals.early` ends and `late` starts.
 
@@ -100,9 +97,9 @@ class Motion:
         Number of sample intervals.
     """
 
-    def __init__(self, scenario: Scenario, body: Body, interval_ns: int, split_s: float = 0.0) -> None:
+    def __init__(self, scenario: Scenario, body: Body, split_s: float = 0.0) -> None:
         self._body = body
-        quadrature = Quadrature(interval_ns * NS, split_s, _case_bandwidth(body.case))
+        quadrature = Quadrature(body.interval_s, split_s, _case_bandwidth(body.case))
         C_nb = start_attitude(scenario.start)
         self._segments = []
         for number, entry in enumerate(scenario.motion):

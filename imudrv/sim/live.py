@@ -9,16 +9,16 @@ import threading
 import time
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass
 from math import ceil
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from imudrv.errors import InputError
 from imudrv.profiles.schema import Profile
 from imudrv.records import Records
+from imudrv.signals import handled
 from imudrv.sim.capture import WireChunk, wire
 from imudrv.sim.links import open_line
 from imudrv.sim.links.base import LineOptions
@@ -255,43 +255,15 @@ def play(
             if due:
                 last_ns = due.last_ns
                 latest_ns = max(latest_ns, -pace.left_ns(due.first_ns))
-        whole = samples(scenario, layout.interval_ns)
+        whole = samples(scenario, layout.interval)
         line.finish()
     return Played(
-        last_ns // layout.interval_ns if stop.is_set() else whole,
+        round(last_ns / layout.interval) if stop.is_set() else whole,
         line.sent,
         line.undelivered,
         "messages" if layout.can else "bytes",
         None if speed is None else latest_ns,
     )
-
-
-def speed_of(text: str) -> float | None:
-    """Return the speed that a text means: ``1``, ``0.5``, ``10``; ``max`` is None.
-
-    Parameters
-    ----------
-    text : str
-        Text as the user gave it.
-
-    Returns
-    -------
-    float or None
-
-    Raises
-    ------
-    InputError
-        The text is not a speed.
-    """
-    if text == "max":
-        return None
-    try:
-        speed = float(text)
-    except ValueError:
-        speed = 0.0
-    if not 0.001 <= speed <= 1000.0:
-        raise InputError(f"speed: expected max or a number from 0.001 to 1000, got {text!r}")
-    return speed
 
 
 def _ahead(chunks: Iterator[WireChunk]) -> Generator[WireChunk, None, None]:
@@ -303,17 +275,8 @@ def _ahead(chunks: Iterator[WireChunk]) -> Generator[WireChunk, None, None]:
             yield chunk
 
 
-@contextmanager
-def _signals_set(stop: threading.Event) -> Iterator[None]:
+def _signals_set(stop: threading.Event) -> AbstractContextManager[None]:
     """Ctrl-C and SIGTERM end the run."""
     if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        for number in before:
-            signal.signal(number, lambda *_: stop.set())
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        return nullcontext()
+    return handled(lambda *_: stop.set(), signal.SIGINT, signal.SIGTERM)

@@ -4,24 +4,27 @@ Segments of the motion follow each other; each starts at rest in the attitude at
 Durations are rounded to whole sample intervals.
 """
 
-from importlib import resources
+from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field as Key
 from pydantic import model_validator
 
 from imudrv.calibration import Calibration, read_calibration
-from imudrv.errors import InputError
+from imudrv.files import shipped as shipped_files
 from imudrv.files.model import Model
 from imudrv.files.settings_file import parse, read
 from imudrv.site import Site
 from imudrv.units import NS
+from imudrv.wire.layout import Layout
+
+_FOLDER: Final = Path(__file__).parent / "scenarios"
 
 Duration = Annotated[float, Key(gt=0, le=1_000_000)]
 Amount = Annotated[float, Key(ge=0, le=1e6)]
-Fraction = Annotated[float, Key(ge=0, le=1)]
+Proportion = Annotated[float, Key(ge=0, le=1)]
 Tilt = Annotated[float, Key(ge=-200, le=200)]
 Offset = Annotated[float, Key(ge=-10_000, le=10_000)]
 Frequency = Annotated[float, Key(gt=0, le=2000)]
@@ -164,7 +167,7 @@ class Dither(Model):
 
     amplitude_arcsec: tuple[Rate, Rate, Rate]
     frequency_hz: tuple[Frequency, Frequency, Frequency]
-    in_increments: Fraction = 0.0
+    in_increments: Proportion = 0.0
     case_reaction: Annotated[float, Key(ge=0, le=0.1)] = 0.0
 
 
@@ -184,14 +187,17 @@ class Temperature(Model):
 
 
 class Saturation(Model):
-    """Maximum number of pulses of an axis in one sample interval; further pulses are lost."""
+    """Maximum number of pulses of an axis in one sample interval; further pulses are lost.
+
+    Any axis saturates at the limits of its field, too.
+    """
 
     gyro_pulses: Limit = 2**31 - 1
     accelerometer_pulses: Limit = 2**31 - 1
 
 
 class Unit(Model):
-    """Unit: its calibration (a file, or inline, by default that of the nominal unit) and its errors.
+    """Unit: its calibration (a file, or inline, by default a nominal one for the profile) and its errors.
 
     The path of the file is relative to the scenario. Residuals make the unit differ from its calibration.
     The sample interval of the accelerometers ends `accelerometer_skew_s` later than that of the gyros.
@@ -226,47 +232,45 @@ class Unplug(Silence):
 
 
 class CounterJump(Model):
-    """Jump of the counter by `by` at the first sample that ends after `at_s`; a jump back is a restart."""
+    """Jump of the counter by `by` at the first sample that ends after `at_s`; a jump back is a restart.
+
+    A time jumps by as many samples.
+    """
 
     at_s: Annotated[float, Key(ge=0, le=1e7)]
     by: Annotated[int, Key(ge=-(2**32), le=2**32)]
 
 
-class StreamRates(Model):
+class _Rates(Model):
+    """Probabilities of faults that exclude each other."""
+
+    @model_validator(mode="after")
+    def _at_most_one(self) -> Self:
+        total = sum(self.model_dump().values())
+        if total > 1.0:
+            raise ValueError(f"expected probabilities with a sum of at most 1, got {total:g}")
+        return self
+
+
+class StreamRates(_Rates):
     """Probabilities of the faults of a serial line per frame; a frame has at most one fault."""
 
-    bit_flips: Fraction = 0.0
-    bytes_lost: Fraction = 0.0
-    bytes_inserted: Fraction = 0.0
-    false_sync_inside: Fraction = 0.0
-    frame_lost: Fraction = 0.0
-    bytes_between: Fraction = 0.0
-    false_sync_between: Fraction = 0.0
-    frame_doubled: Fraction = 0.0
-
-    @model_validator(mode="after")
-    def _no_more_than_all(self) -> Self:
-        _at_most_one(self)
-        return self
+    bit_flips: Proportion = 0.0
+    bytes_lost: Proportion = 0.0
+    bytes_inserted: Proportion = 0.0
+    false_sync_inside: Proportion = 0.0
+    frame_lost: Proportion = 0.0
+    bytes_between: Proportion = 0.0
+    false_sync_between: Proportion = 0.0
+    frame_doubled: Proportion = 0.0
 
 
-class MessageRates(Model):
+class MessageRates(_Rates):
     """Probabilities of the faults of a CAN bus per message; a message has at most one fault."""
 
-    lost: Fraction = 0.0
-    doubled: Fraction = 0.0
-    swapped: Fraction = 0.0
-
-    @model_validator(mode="after")
-    def _no_more_than_all(self) -> Self:
-        _at_most_one(self)
-        return self
-
-
-def _at_most_one(rates: StreamRates | MessageRates) -> None:
-    total = sum(rates.model_dump().values())
-    if total > 1.0:
-        raise ValueError(f"expected probabilities with a sum of at most 1, got {total:g}")
+    lost: Proportion = 0.0
+    doubled: Proportion = 0.0
+    swapped: Proportion = 0.0
 
 
 class Faults(Model):
@@ -326,14 +330,12 @@ NOMINAL = parse(
     Calibration,
     "nominal unit",
 )
-"""Calibration of a scenario without one: nominal scales, no errors, lever arms of about 30 mm."""
+"""Calibration of a unit that sends pulses: nominal scales, no errors, lever arms of about 30 mm."""
 
 
 def shipped() -> list[str]:
     """Return the names of the scenarios that come with the package."""
-    return sorted(
-        p.name.removesuffix(".yaml") for p in (resources.files(__package__) / "scenarios").iterdir()
-    )
+    return shipped_files.names(_FOLDER)
 
 
 def load(name_or_path: str) -> Scenario:
@@ -354,15 +356,13 @@ def load(name_or_path: str) -> Scenario:
     InputError
         The scenario does not exist, or it or its calibration file is not valid.
     """
-    if name_or_path in shipped():
-        with resources.as_file(resources.files(__package__) / "scenarios" / f"{name_or_path}.yaml") as path:
-            return _read(path)
-    if not Path(name_or_path).exists():
-        raise InputError(
-            f"scenario {name_or_path!r}: expected one of {', '.join(shipped())}, "
-            "or the path of a scenario file; there is no such file"
-        )
-    return _read(Path(name_or_path))
+    path = shipped_files.find("scenario", name_or_path, _FOLDER)
+    scenario = read(path, Scenario)
+    if scenario.unit.calibration_file is None:
+        return scenario
+    calibration = read_calibration(path.parent / scenario.unit.calibration_file)
+    unit = scenario.unit.model_copy(update={"calibration_file": None, "calibration": calibration})
+    return scenario.model_copy(update={"unit": unit})
 
 
 def files(name_or_path: str) -> tuple[Path, ...]:
@@ -374,30 +374,43 @@ def files(name_or_path: str) -> tuple[Path, ...]:
     return (path,) if calibration is None else (path, path.parent / calibration)
 
 
-def _read(path: Path) -> Scenario:
-    scenario = read(path, Scenario)
-    if scenario.unit.calibration_file is None:
-        return scenario
-    calibration = read_calibration(path.parent / scenario.unit.calibration_file)
-    unit = scenario.unit.model_copy(update={"calibration_file": None, "calibration": calibration})
-    return scenario.model_copy(update={"unit": unit})
+def nominal(layout: Layout) -> Calibration:
+    """Return the calibration of a scenario without one.
+
+    Parameters
+    ----------
+    layout : Layout
+        Layout of the profile.
+
+    Returns
+    -------
+    Calibration
+        `NOMINAL`, with scales of 1 for a sensor that sends no pulses.
+    """
+    gyro, accelerometer = NOMINAL.gyro, NOMINAL.accelerometer
+    ones = {"scale": (1.0, 1.0, 1.0)}
+    if not layout.gyro.in_pulses:
+        gyro = gyro.model_copy(update={"scale_arcsec_per_pulse": None} | ones)
+    if not layout.accelerometer.in_pulses:
+        accelerometer = accelerometer.model_copy(update={"scale_pulse_per_m_s": None} | ones)
+    return NOMINAL.model_copy(update={"gyro": gyro, "accelerometer": accelerometer})
 
 
-def samples(scenario: Scenario, interval_ns: int) -> int:
+def samples(scenario: Scenario, interval: Fraction) -> int:
     """Return the number of samples of a scenario; each segment is rounded to whole intervals.
 
     Parameters
     ----------
     scenario : Scenario
         The scenario.
-    interval_ns : int
+    interval : Fraction
         Sample interval, ns.
 
     Returns
     -------
     int
     """
-    return sum(intervals(segment.motion.duration_s, interval_ns * NS) for segment in scenario.motion)
+    return sum(intervals(segment.motion.duration_s, interval * NS) for segment in scenario.motion)
 
 
 def intervals(duration_s: float, interval_s: float) -> int:

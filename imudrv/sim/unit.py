@@ -1,4 +1,4 @@
-"""Simulated unit: true integrals of motion to pulses, with the errors of the unit, and the truth.
+"""Simulated unit: true integrals of motion to increments, with the errors of the unit, and the truth.
 
 The true unit is a calibration, with the conventions of the file inverted, that differs by drawn residuals
 from the one that will compensate it:
@@ -7,34 +7,36 @@ from the one that will compensate it:
     accelerometer i      N_i = K_i (integral of f_i + b_i tau)
 
 with `k_g`, `K`, `b_g`, `b` each at the temperature of the sample: the scale in the file times
-`1 + ppm_per_k (T - T_reference)`, the bias plus `bias_per_k (T - T_reference)`. Pulses are integers; the
-fraction is carried into the next sample.
+`1 + ppm_per_k (T - T_reference)`, the bias plus `bias_per_k (T - T_reference)`. `N` are pulses, or rad and
+m/s of a unit that sends other units. Pulses and counts of increments and totals are integers; the fraction is
+carried into the next sample. The encoder makes counts of rates and of floating-point numbers.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import exp, pi, sin
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from imudrv.arrays import Array
+from imudrv.calibration import Calibration, coefficients
 from imudrv.errors import InputError
+from imudrv.imu.coefficients import Coefficients, TemperatureTerms
+from imudrv.imu.compensation import require_sensors
+from imudrv.imu.conversion import constants
 from imudrv.kernels import kernel
 from imudrv.nav.earth import earth_rate_n
-from imudrv.records import PULSES, Records
+from imudrv.records import Records, samples_type
 from imudrv.sim.integrate import Body, Dithering, Integrals, Motion
 from imudrv.sim.path import cycles_at, split_cycles
-from imudrv.sim.scenario import NOMINAL, Dither, Faults, Scenario
+from imudrv.sim.scenario import Dither, Faults, Saturation, Scenario, nominal
 from imudrv.units import ARCSEC, DEG_PER_H, DEG_PER_SQRT_H, MM, NS, PPM, UG, URAD
 from imudrv.vectors import Vector, dot, row
+from imudrv.wire.layout import Layout, SequenceKind, Values
 
 PER_SQRT_H: Final = 1.0 / 60.0
 """1/sqrt(h) in 1/sqrt(s)."""
-STATUS_WARM_UP: Final = 1 << 0
-"""Status bit: warm-up (ICD, section 2)."""
-STATUS_OVERFLOW: Final = 1 << 10
-"""Status bit: pulse overflow of an axis (ICD, section 2)."""
 
 TRUTH: Final = np.dtype(
     [
@@ -56,8 +58,8 @@ class Chunk:
 
     Attributes
     ----------
-    pulses : ndarray of PULSES
-        Pulses, with times since the start of the run. Flags are zero: sequence tracking sets them.
+    pulses : ndarray of `imudrv.records.samples_type`
+        Samples, with times since the start of the run. Flags are zero: sequence tracking sets them.
     truth : ndarray of TRUTH
         Truth of the same samples.
     """
@@ -66,26 +68,17 @@ class Chunk:
     truth: Records
 
 
-@dataclass(frozen=True)
-class TrueUnit:
-    """True parameters of a unit, in SI units; arrays are by sensor axis, matrices as in the file."""
+class _Counts(NamedTuple):
+    """What each axis can send, gyro and accelerometer X Y Z: arrays of shape (6,)."""
 
-    gyro_scale: Array  # rad per pulse
-    gyro_bias: Array  # rad/s, on body axes
-    C_bg: Array
-    accelerometer_scale: Array  # pulses per m/s
-    accelerometer_bias: Array  # m/s^2
-    C_ba: Array
-    r_b: Array  # (3, 3), row i the sensing point of accelerometer i, m
-    reference_degc: float
-    gyro_bias_per_k: Array
-    gyro_scale_per_k: Array
-    accelerometer_bias_per_k: Array
-    accelerometer_scale_per_k: Array
+    quantum: Array  # of one count: pulses, rad or m/s; NaN for an axis that the unit lacks
+    is_whole: np.ndarray  # whether counts are rounded here, the fraction carried
+    lowest: Array  # counts of a sample
+    highest: Array
 
 
 class _Electronics(NamedTuple):
-    """Parameters of the kernel, from integrals to pulses; gyro quantities are on the axes of the gyros."""
+    """Parameters of the kernel from integrals to increments; gyro quantities are on the axes of the gyros."""
 
     interval_s: float
     G: Array  # C_bg^-1
@@ -94,14 +87,13 @@ class _Electronics(NamedTuple):
     gyro_bias_per_k: Array
     gyro_scale_per_k: Array
     gyro_noise: float  # 1 sigma of an increment, rad
-    gyro_limit: float
     dither: Dithering  # part in the gyro increments
     accelerometer_scale: Array
     accelerometer_bias: Array
     accelerometer_bias_per_k: Array
     accelerometer_scale_per_k: Array
     accelerometer_noise: float  # m/s
-    accelerometer_limit: float
+    counts: _Counts
     reference_degc: float
     start_degc: float
     slope_k_per_s: float
@@ -109,52 +101,53 @@ class _Electronics(NamedTuple):
     time_constant_s: float
 
 
-def draw_true_unit(scenario: Scenario) -> TrueUnit:
+def draw_true_unit(scenario: Scenario, layout: Layout) -> Coefficients:
     """Draw the true unit from the calibration, the residuals and the seed of a scenario.
 
     Parameters
     ----------
     scenario : Scenario
         `unit` and `seed` are used; the seed gives the normalised residuals, scaled by their 1-sigma.
+    layout : Layout
+        Layout of the profile.
 
     Returns
     -------
-    TrueUnit
+    Coefficients
+
+    Raises
+    ------
+    InputError
+        The calibration is of pulses, and the unit sends other units, or the other way round.
     """
-    calibration = scenario.unit.calibration or NOMINAL
+    certified = coefficients(_certificate(scenario, layout))
+    require_sensors(certified, layout)
     residuals = scenario.unit.residuals
-    gyro, accelerometer, temperature = calibration.gyro, calibration.accelerometer, calibration.temperature
-    rng = _generator(scenario, 2)
-    gyro_normal, accelerometer_normal = rng.standard_normal((2, 12))
-    none = np.zeros(3)
-    return TrueUnit(
-        gyro_scale=gyro.scale_rad_per_pulse * (1.0 + residuals.gyro_scale_ppm * PPM * gyro_normal[0:3]),
-        gyro_bias=gyro.bias_rad_per_s + residuals.gyro_bias_deg_per_h * DEG_PER_H * gyro_normal[3:6],
-        C_bg=_misaligned(residuals.gyro_misalignment_urad, gyro_normal[6:]) @ gyro.C_bg_array,
-        accelerometer_scale=accelerometer.scale_pulse_per_m_s_array
+    gyro_normal, accelerometer_normal = _generator(scenario, 2).standard_normal((2, 12))
+    return replace(
+        certified,
+        gyro_scale=certified.gyro_scale * (1.0 + residuals.gyro_scale_ppm * PPM * gyro_normal[0:3]),
+        gyro_bias=certified.gyro_bias + residuals.gyro_bias_deg_per_h * DEG_PER_H * gyro_normal[3:6],
+        C_bg=_misaligned(residuals.gyro_misalignment_urad, gyro_normal[6:]) @ certified.C_bg,
+        accelerometer_scale=certified.accelerometer_scale
         * (1.0 + residuals.accelerometer_scale_ppm * PPM * accelerometer_normal[0:3]),
-        accelerometer_bias=accelerometer.bias_m_s2
+        accelerometer_bias=certified.accelerometer_bias
         + residuals.accelerometer_bias_ug * UG * accelerometer_normal[3:6],
         C_ba=_misaligned(residuals.accelerometer_misalignment_urad, accelerometer_normal[6:])
-        @ accelerometer.C_ba_array,
-        r_b=calibration.size_effect.r_m if calibration.size_effect else np.zeros((3, 3)),
-        reference_degc=temperature.reference_degc if temperature else 0.0,
-        gyro_bias_per_k=temperature.gyro_bias_rad_per_s_per_k if temperature else none,
-        gyro_scale_per_k=temperature.gyro_scale_per_k if temperature else none,
-        accelerometer_bias_per_k=temperature.accelerometer_bias_m_s2_per_k if temperature else none,
-        accelerometer_scale_per_k=temperature.accelerometer_scale_per_k if temperature else none,
+        @ certified.C_ba,
     )
 
 
-def simulate(scenario: Scenario, interval_ns: int, chunk: int = 65_536) -> Iterator[Chunk]:
+def simulate(scenario: Scenario, layout: Layout, chunk: int = 65_536) -> Iterator[Chunk]:
     """Simulate a scenario.
 
     Parameters
     ----------
     scenario : Scenario
-        Scenario; of `faults` only the counter jumps apply here, the others act on the wire.
-    interval_ns : int
-        Sample interval; durations of the motion are rounded to whole intervals.
+        Scenario; of `faults` only the counter jumps apply here, the others act on the wire. What an axis
+        cannot send saturates.
+    layout : Layout
+        Layout of the profile; durations of the motion are rounded to whole sample intervals.
     chunk : int
         Number of samples at a time; any value gives the same bits.
 
@@ -166,19 +159,25 @@ def simulate(scenario: Scenario, interval_ns: int, chunk: int = 65_536) -> Itera
     Raises
     ------
     InputError
-        The interval or the chunk is out of range.
+        The interval or the chunk is out of range, or the calibration is not one for the profile.
     """
-    if not 10_000 <= interval_ns <= 1_000_000_000:
-        raise InputError(f"simulation: expected a sample interval of 10 us to 1 s, got {interval_ns} ns")
+    interval, step = layout.interval, layout.counter_step
+    if not 10_000 <= interval <= 1_000_000_000:
+        raise InputError(
+            f"simulation: expected a sample interval of 10 us to 1 s, got {layout.interval_ns} ns"
+        )
     if chunk < 1:
         raise InputError(f"simulation: expected chunks of at least one sample, got {chunk}")
-    interval_s = interval_ns * NS
-    truth = draw_true_unit(scenario)
+    interval_s = interval * NS
+    truth = draw_true_unit(scenario, layout)
     rng = _generator(scenario, 3)
     # With a skew, an accelerometer sample is the late part of one interval and the early part of a later one.
-    skew, split_ns = divmod(round(scenario.unit.accelerometer_skew_s / NS), interval_ns)
-    motion = Motion(scenario, _body(scenario, truth, interval_s), interval_ns, split_ns * NS)
-    electronics = _electronics(scenario, truth, interval_s)
+    skew, split_ns = divmod(round(scenario.unit.accelerometer_skew_s / NS), interval)
+    motion = Motion(scenario, _body(scenario, truth, interval_s), split_ns * NS)
+    electronics = _electronics(scenario, truth, layout)
+    gyro, accelerometer = layout.sensors
+    kind = samples_type(gyro_pulses=gyro.is_counted, accelerometer_pulses=accelerometer.is_counted)
+    start = scenario.start.counter if layout.sequence.kind is SequenceKind.COUNTER else 0
     carry = np.zeros(6)
     for first in range(0, motion.samples, chunk):
         n = min(chunk, motion.samples - first)
@@ -187,21 +186,23 @@ def simulate(scenario: Scenario, interval_ns: int, chunk: int = 65_536) -> Itera
         own = Integrals(*(a[-begin : n - begin] for a in around))
         later = skew - begin
         velocity = around.late[later : later + n] + around.early[later + 1 : later + 1 + n]
-        pulses = np.zeros(n, PULSES)
-        counter = scenario.start.counter + np.arange(first, first + n)
-        t_ns = (np.arange(first, first + n) + 1) * interval_ns
+        pulses = np.zeros(n, kind)
+        ends_ns = np.arange(first, first + n + 1) * interval.numerator // interval.denominator
+        t_ns = ends_ns[1:]
+        counter = start + step * np.arange(first, first + n)
         pulses["counter"] = counter + jumped(scenario.faults, t_ns)
         pulses["arrival_ns"] = pulses["elapsed_ns"] = t_ns
-        pulses["interval_ns"] = interval_ns
+        pulses["interval_ns"] = np.diff(ends_ns)
         noise = rng.standard_normal((n, 6))
-        counts = np.empty((n, 6), np.int64)
+        increments = np.empty((n, 6))
         degc = np.empty(n)
         overflow = np.empty(n, np.bool_)
-        _count(electronics, first, own.dtheta_b, velocity, noise, carry, counts, degc, overflow)
-        pulses["gyro"], pulses["accelerometer"] = counts[:, :3], counts[:, 3:]
+        _count(electronics, first, own.dtheta_b, velocity, noise, carry, increments, degc, overflow)
+        pulses["gyro"], pulses["accelerometer"] = increments[:, :3], increments[:, 3:]
         pulses["temperature_degc"] = degc[:, None]
         warm_up = t_ns * NS <= scenario.unit.warm_up_s
-        pulses["status"] = STATUS_WARM_UP * warm_up + STATUS_OVERFLOW * overflow
+        meaning = layout.status
+        pulses["status"] = meaning.inverted ^ (meaning.warm_up * warm_up | meaning.saturated * overflow)
         yield Chunk(pulses, _truth(pulses, own))
 
 
@@ -225,6 +226,10 @@ def jumped(faults: Faults, t_ns: np.ndarray) -> np.ndarray:
     return total
 
 
+def _certificate(scenario: Scenario, layout: Layout) -> Calibration:
+    return scenario.unit.calibration or nominal(layout)
+
+
 def _generator(scenario: Scenario, stream: int) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(scenario.seed, spawn_key=(stream,)))
 
@@ -239,7 +244,7 @@ def _inverse(matrix: Array) -> Array:
     return np.asarray(np.linalg.inv(matrix), np.float64)
 
 
-def _body(scenario: Scenario, truth: TrueUnit, interval_s: float) -> Body:
+def _body(scenario: Scenario, truth: Coefficients, interval_s: float) -> Body:
     site = scenario.site
     x, y, z = (MM * offset for offset in scenario.start.pivot_offset_mm)
     dither = scenario.unit.dither
@@ -249,12 +254,12 @@ def _body(scenario: Scenario, truth: TrueUnit, interval_s: float) -> Body:
         omega_ie_n=earth_rate_n(site.latitude_rad),
         pivot_to_origin_b=(x, y, z),
         A=_inverse(truth.C_ba),
-        r_b=np.ascontiguousarray(truth.r_b),
+        r_b=np.zeros((3, 3)) if truth.r_b is None else truth.r_b,
         case=_dithering(scenario, truth, interval_s, dither.case_reaction if dither else 0.0),
     )
 
 
-def _dithering(scenario: Scenario, truth: TrueUnit, interval_s: float, fraction: float) -> Dithering:
+def _dithering(scenario: Scenario, truth: Coefficients, interval_s: float, fraction: float) -> Dithering:
     dither = scenario.unit.dither or Dither(amplitude_arcsec=(0.0, 0.0, 0.0), frequency_hz=(1.0, 1.0, 1.0))
     G = _inverse(truth.C_bg)  # rows: the gyros' sensing directions in b
     frequency_hz = np.array(dither.frequency_hz)
@@ -267,28 +272,51 @@ def _dithering(scenario: Scenario, truth: TrueUnit, interval_s: float, fraction:
     )
 
 
-def _electronics(scenario: Scenario, truth: TrueUnit, interval_s: float) -> _Electronics:
-    unit = scenario.unit
+def _counts(layout: Layout, limits: Saturation) -> _Counts:
+    counts = _Counts(np.full(6, np.nan), np.zeros(6, np.bool_), np.full(6, -np.inf), np.full(6, np.inf))
+    converted = constants(layout)[0]
+    for first, name, sensor, pulses in (
+        (0, "gyro", layout.gyro, limits.gyro_pulses),
+        (3, "accelerometer", layout.accelerometer, limits.accelerometer_pulses),
+    ):
+        is_rate = sensor.values is Values.RATE
+        for k, axis in enumerate(sensor.axes):
+            if axis is None:
+                continue
+            m = first + k
+            counts.quantum[m] = sensor.per_count[k] * (layout.interval_ns * NS if is_rate else 1.0)
+            counts.is_whole[m] = sensor.in_pulses or not (axis.is_float or is_rate)
+            lowest, highest = converted[name]["lowest"][k], converted[name]["highest"][k]
+            if sensor.values is Values.TOTAL:  # n bits distinguish as many increments as a signed number
+                lowest, highest = 1 - (1 << (axis.bits - 1)), (1 << (axis.bits - 1)) - 1
+            if sensor.in_pulses:
+                lowest, highest = max(lowest, -pulses), min(highest, pulses)
+            counts.lowest[m], counts.highest[m] = lowest, highest
+    return counts
+
+
+def _electronics(scenario: Scenario, truth: Coefficients, layout: Layout) -> _Electronics:
+    unit, interval_s = scenario.unit, layout.interval * NS
     dither, temperature = unit.dither, unit.temperature
     settles = temperature.settles_at_degc
     G = _inverse(truth.C_bg)
+    terms = truth.temperature or TemperatureTerms(0.0, 0.0, 0.0)
     return _Electronics(
         interval_s=interval_s,
         G=G,
         gyro_scale=truth.gyro_scale,
         gyro_bias=truth.gyro_bias,
-        gyro_bias_per_k=truth.gyro_bias_per_k,
-        gyro_scale_per_k=truth.gyro_scale_per_k,
+        gyro_bias_per_k=terms.gyro_bias,
+        gyro_scale_per_k=terms.gyro_scale,
         gyro_noise=unit.noise.arw_deg_per_sqrt_h * DEG_PER_SQRT_H * interval_s**0.5,
-        gyro_limit=float(unit.saturation.gyro_pulses),
         dither=_dithering(scenario, truth, interval_s, dither.in_increments if dither else 0.0),
         accelerometer_scale=truth.accelerometer_scale,
         accelerometer_bias=truth.accelerometer_bias,
-        accelerometer_bias_per_k=truth.accelerometer_bias_per_k,
-        accelerometer_scale_per_k=truth.accelerometer_scale_per_k,
+        accelerometer_bias_per_k=terms.accelerometer_bias,
+        accelerometer_scale_per_k=terms.accelerometer_scale,
         accelerometer_noise=unit.noise.vrw_m_s_per_sqrt_h * PER_SQRT_H * interval_s**0.5,
-        accelerometer_limit=float(unit.saturation.accelerometer_pulses),
-        reference_degc=truth.reference_degc,
+        counts=_counts(layout, unit.saturation),
+        reference_degc=terms.reference_degc,
         start_degc=temperature.start_degc,
         slope_k_per_s=temperature.slope_k_per_h / 3600.0,
         rise_k=0.0 if settles is None else settles - temperature.start_degc,
@@ -313,11 +341,11 @@ def _count(
     velocity: Array,
     noise: Array,
     carry: Array,
-    counts: np.ndarray,
+    increments: Array,
     degc: Array,
     overflow: np.ndarray,
 ) -> None:
-    """Fill `counts` (n, 6) from sample `first` on; `carry` (6,) is the fraction of a pulse of each axis."""
+    """Fill `increments` (n, 6) from sample `first` on; `carry` (6,) holds the fraction of a count."""
     tau = unit.interval_s
     before = _dither_angle(unit.dither, first)
     for i in range(dtheta_b.shape[0]):
@@ -336,16 +364,14 @@ def _count(
         for m in range(3):
             angle = dot(row(unit.G, m), angle_b) + angle_now[m] - before[m] + unit.gyro_noise * noise[i, m]
             scale = unit.gyro_scale[m] * (1.0 + warmer * unit.gyro_scale_per_k[m])
-            pulses = _quantise(angle / scale, carry, m)
-            counts[i, m] = min(max(pulses, -unit.gyro_limit), unit.gyro_limit)
-            overflow[i] |= abs(pulses) > unit.gyro_limit
+            increments[i, m], is_over = _sent(angle / scale, unit.counts, carry, m)
+            overflow[i] |= is_over
         for m in range(3):
             bias = unit.accelerometer_bias[m] + warmer * unit.accelerometer_bias_per_k[m]
             speed = velocity[i, m] + tau * bias + unit.accelerometer_noise * noise[i, 3 + m]
             scale = unit.accelerometer_scale[m] * (1.0 + warmer * unit.accelerometer_scale_per_k[m])
-            pulses = _quantise(speed * scale, carry, 3 + m)
-            counts[i, 3 + m] = min(max(pulses, -unit.accelerometer_limit), unit.accelerometer_limit)
-            overflow[i] |= abs(pulses) > unit.accelerometer_limit
+            increments[i, 3 + m], is_over = _sent(speed * scale, unit.counts, carry, 3 + m)
+            overflow[i] |= is_over
         before = angle_now
 
 
@@ -361,8 +387,19 @@ def _dither_angle(dither: Dithering, interval: int) -> Vector:
 
 
 @kernel
-def _quantise(pulses: float, carry: Array, axis: int) -> float:
-    total = carry[axis] + pulses
+def _sent(increment: float, counts: _Counts, carry: Array, axis: int) -> tuple[float, bool]:
+    """Return what an axis sends of an increment, and whether that was too large for it."""
+    quantum = counts.quantum[axis]
+    number = increment / quantum
+    if counts.is_whole[axis]:
+        number = _quantise(number, carry, axis)
+    lowest, highest = counts.lowest[axis], counts.highest[axis]
+    return min(max(number, lowest), highest) * quantum, number < lowest or number > highest
+
+
+@kernel
+def _quantise(number: float, carry: Array, axis: int) -> float:
+    total = carry[axis] + number
     whole: float = np.rint(total)
     carry[axis] = total - whole
     return whole

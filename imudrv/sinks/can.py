@@ -13,9 +13,9 @@ from imudrv import profiles
 from imudrv.errors import InputError
 from imudrv.ports.base import PortLostError
 from imudrv.ports.can import prepare
-from imudrv.ports.url import split
-from imudrv.records import PULSES, Records
+from imudrv.records import EXTENDED, PULSES, Records
 from imudrv.sinks.base import Batch, Sink, SinkState
+from imudrv.url import split
 from imudrv.wire.encode import CanEncoder
 from imudrv.wire.layout import Layout
 
@@ -44,7 +44,7 @@ class CanSink(Sink):
     Raises
     ------
     InputError
-        Unknown interface or profile, or a profile with another sample rate than that of the unit.
+        Unknown interface or profile, or a profile with another sample rate or other numbers than the unit's.
     """
 
     def __init__(self, url: str, layout: Layout) -> None:
@@ -55,11 +55,13 @@ class CanSink(Sink):
         profile = profiles.load(parts.options.pop("profile"))
         self._open = prepare(parts, profile)
         self._layout = profile.layout()
-        if self._layout.interval_ns != layout.interval_ns:
+        if self._layout.interval != layout.interval:
             raise InputError(
-                f"{url}: expected a profile of {1e9 / layout.interval_ns:g} samples/s like the unit, "
-                f"got {profile.name} with {profile.sample_rate_hz:g}; choose another profile"
+                f"{url}: expected a profile of {float(1e9 / layout.interval):g} samples/s like the unit, "
+                f"got {profile.name} with {profile.rate_hz:g}; choose another profile"
             )
+        _require_same_numbers(url, self._layout, layout)
+        self._steps = layout.counter_step, self._layout.counter_step
         self._temperatures = _related(layout.temperature_names, self._layout.temperature_names)
         CanEncoder(self._layout).encode(np.zeros(1, PULSES))  # compile before samples arrive
         self._encoder = CanEncoder(self._layout)
@@ -140,7 +142,8 @@ class CanSink(Sink):
 
     def _send(self, bus: can.BusABC, pulses: Records) -> bool:
         """Send one sample; return whether the profile can represent it."""
-        if pulses["interval_ns"][0] != self._layout.interval_ns and not self._layout.totals:
+        is_long = pulses["interval_ns"][0] > self._layout.interval_ns + 1  # 1 ns: a rate that is a ratio
+        if is_long and not self._layout.totals:
             return False
         try:
             messages = self._encoder.encode(self._renamed(pulses))
@@ -150,8 +153,8 @@ class CanSink(Sink):
             identifier, length = int(message["id"]), int(message["length"])
             bus.send(
                 can.Message(
-                    arbitration_id=identifier,
-                    is_extended_id=identifier > 0x7FF,
+                    arbitration_id=identifier & ~EXTENDED,
+                    is_extended_id=bool(identifier & EXTENDED),
                     is_fd=self._layout.fd,
                     bitrate_switch=self._layout.fd,
                     data=message["data"][:length].tobytes(),
@@ -161,12 +164,36 @@ class CanSink(Sink):
         return True
 
     def _renamed(self, pulses: Records) -> Records:
-        """Move temperatures to the channels where the outgoing profile has them."""
+        """Count, and put temperatures into the channels, as the outgoing profile does."""
         renamed = pulses.copy()
+        own, outgoing = self._steps
+        renamed["counter"] = pulses["counter"] // own * outgoing
         for channel, sources in enumerate(self._temperatures):
             degc = pulses["temperature_degc"][:, sources].mean(axis=1) if sources else np.nan
             renamed["temperature_degc"][:, channel] = degc
         return renamed
+
+
+def _require_same_numbers(url: str, outgoing: Layout, layout: Layout) -> None:
+    """Refuse a profile that cannot carry what the unit sends."""
+    for name, sends, carries in (
+        ("gyro", layout.gyro, outgoing.gyro),
+        ("accelerometer", layout.accelerometer, outgoing.accelerometer),
+    ):
+        if any(theirs and not own for theirs, own in zip(carries.axes, sends.axes, strict=True)):
+            raise InputError(
+                f"{url}: {name}: expected a profile for the axes that {layout.name} has, got {outgoing.name} "
+                "with more; choose another profile"
+            )
+        if any(carries.axes) and sends.in_pulses != carries.in_pulses:
+            own, theirs = (
+                "pulses" if one.in_pulses else "other units than pulses" for one in (sends, carries)
+            )
+            raise InputError(
+                f"{url}: {name}: expected a profile for {own}, as {layout.name} sends them, got "
+                f"{outgoing.name} for {theirs}: samples go out uncalibrated, and without the calibration one "
+                "cannot be made from the other; choose another profile"
+            )
 
 
 def _related(have: tuple[str, ...], want: tuple[str, ...]) -> list[list[int]]:

@@ -45,10 +45,12 @@ class History:
     ----------
     max_bytes : int
         Maximum memory; the oldest reads are dropped above it.
+    counter_step : int
+        Change of the unit's counter from a sample to the next; the counters here count samples.
     """
 
-    def __init__(self, max_bytes: int = MAX_BYTES) -> None:
-        self._max_bytes = max_bytes
+    def __init__(self, max_bytes: int = MAX_BYTES, counter_step: int = 1) -> None:
+        self._max_bytes, self._counter_step = max_bytes, counter_step
         self._bytes = 0
         self._moments: deque[Moment] = deque()
 
@@ -62,7 +64,7 @@ class History:
     def publish(self, batch: Batch) -> None:
         """Add the samples that the newest read completed."""
         if len(batch.pulses) and self._moments:
-            counter = batch.pulses["counter"]
+            counter = batch.pulses["counter"] // self._counter_step
             newest = self._moments[-1]._replace(
                 datagrams=batch.datagrams, first=int(counter[0]), last=int(counter[-1])
             )
@@ -98,5 +100,4 @@ class History:
 
 
 def _size(moment: Moment) -> int:
-    data = moment.arrival.data
-    return (len(data) if isinstance(data, bytes) else data.nbytes) + len(moment.datagrams) + _OBJECT_BYTES
+    return moment.arrival.size + len(moment.datagrams) + _OBJECT_BYTES

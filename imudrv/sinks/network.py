@@ -4,11 +4,11 @@ import select
 import socket
 import time
 from typing import Any, Final, TypeAlias
-from urllib.parse import urlsplit
 
 from imudrv.errors import InputError
 from imudrv.sinks.backlog import Backlog
 from imudrv.sinks.base import Batch, Sink, SinkState
+from imudrv.url import LOOPBACK, host_and_port, split
 from imudrv.wire.datagram import SIZE
 
 MAX_CLIENTS: Final = 32
@@ -158,7 +158,7 @@ class TcpSink(Sink):
 
     def __init__(self, url: str) -> None:
         super().__init__(url)
-        family, address = _resolve(url, "127.0.0.1", socket.SOCK_STREAM)
+        family, address = _resolve(url, LOOPBACK, socket.SOCK_STREAM)
         self._clients: list[_Client] = []
         self._sent = self._dropped = 0  # of disconnected clients
         self._listener = socket.socket(family, socket.SOCK_STREAM)
@@ -178,8 +178,7 @@ class TcpSink(Sink):
 
     def publish(self, batch: Batch) -> None:
         """Send a batch."""
-        gone = [client for client in self._clients if not client.put(batch.datagrams)]
-        for client in gone:
+        for client in [client for client in self._clients if not client.put(batch.datagrams)]:
             self._remove(client)
 
     def poll(self) -> None:
@@ -236,13 +235,7 @@ class TcpSink(Sink):
 
 def _resolve(url: str, default_host: str | None, kind: socket.SocketKind) -> _Resolved:
     """Return the address of a URL; without a default the host must be given."""
-    try:
-        parts = urlsplit(url)
-        host, port = parts.hostname or default_host, parts.port
-        if host is None or port is None or parts.path.strip("/") or parts.query:
-            raise ValueError("something else")
-    except ValueError as error:
-        raise InputError(f"{url}: expected {url.split(':')[0]}://HOST:PORT, got {error}") from error
+    host, port = host_and_port(split(url, ("udp", "tcp")), default_host)
     try:
         found = socket.getaddrinfo(host, port, type=kind)
     except OSError as error:

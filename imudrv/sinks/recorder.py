@@ -12,6 +12,7 @@ from contextlib import suppress
 from hashlib import sha256
 from importlib.metadata import version
 from io import BytesIO
+from operator import attrgetter
 from pathlib import Path
 from typing import Final, Generic, TypeVar
 
@@ -23,7 +24,7 @@ from imudrv.files.spool import AppendThread, Piece
 from imudrv.hostclock import now_ns
 from imudrv.recording import format
 from imudrv.recording.format import pack_messages
-from imudrv.records import Arrival, Source
+from imudrv.records import Arrival, Source, Timebase
 from imudrv.sinks.base import Batch, SinkState
 from imudrv.sinks.history import Moment
 from imudrv.wire.datagram import SIZE
@@ -84,13 +85,14 @@ class Recorder:
     ) -> None:
         self._path = path
         self._can = layout.can
-        self._wire: _Queue[Arrival] = _Queue(_array_size if layout.can else _bytes_size)
+        self._wire: _Queue[Arrival] = _Queue(attrgetter("size"))
         self._datagrams: _Queue[bytes] = _Queue(len)
         self._notes: deque[tuple[int, int, Mapping[str, object]]] = deque(maxlen=1000)
         self._calibrations: deque[tuple[int, bytes]] = deque(maxlen=10)
         self._put = 0
         self._reported = 0
-        self._sequences = [0] * 5
+        self._sequences = [0] * 6
+        self._timebase = Timebase()  # of the read written last
         self._staging = _Staging()
         self._writer = Writer(self._staging, use_chunking=False, use_statistics=False)
         self._begin(profile, calibration, source, port, unit)
@@ -122,8 +124,8 @@ class Recorder:
         """
         datagrams = [moment.datagrams for moment in moments if moment.datagrams]
         self._put += sum(map(len, datagrams)) // SIZE
-        self._wire.extend([moment.arrival for moment in moments])
-        self._datagrams.extend(datagrams)
+        self._wire.put(*(moment.arrival for moment in moments))
+        self._datagrams.put(*datagrams)
 
     def status(self, status: Mapping[str, object]) -> None:
         """Record the state of the service.
@@ -191,12 +193,14 @@ class Recorder:
         writer.start(library=f"imu50 {version('imu50')}")
         status = writer.register_schema("imu50.Status", SchemaEncoding.JSONSchema, _STATUS_SCHEMA)
         event = writer.register_schema("imu50.Event", SchemaEncoding.JSONSchema, _EVENT_SCHEMA)
+        clock = writer.register_schema("imu50.Timebase", SchemaEncoding.JSONSchema, _TIMEBASE_SCHEMA)
         wire = format.CAN_MESSAGES if self._can else format.BYTES
-        # the library numbers channels in this order: _WIRE, _INCREMENTS, _STATUS, _EVENTS
+        # the library numbers channels in this order: _WIRE, _INCREMENTS, _STATUS, _EVENTS, _CLOCK
         writer.register_channel(format.WIRE, wire, 0)
         writer.register_channel(format.INCREMENTS, format.DATAGRAMS, 0)
         writer.register_channel(format.STATUS, MessageEncoding.JSON, status)
         writer.register_channel(format.EVENTS, MessageEncoding.JSON, event)
+        writer.register_channel(format.CLOCK, MessageEncoding.JSON, clock)
         origin = {
             "version": version("imu50"),
             "unit": unit,
@@ -221,6 +225,9 @@ class Recorder:
         data = [arrival.data for arrival in arrivals]
         pieces = pack_messages(data) if self._can and data else data  # type: ignore[arg-type]
         for arrival, piece in zip(arrivals, pieces, strict=True):
+            if arrival.timebase != self._timebase:
+                self._timebase = arrival.timebase
+                self._message(_CLOCK, arrival.t_ns, json.dumps(self._timebase._asdict()).encode())
             self._message(_WIRE, arrival.t_ns, piece)  # type: ignore[arg-type]
         batches = self._datagrams.take(_PIECE)
         datagrams = b"".join(batches)
@@ -244,8 +251,11 @@ class Recorder:
         self._staging.write(head + data)
 
 
-_WIRE, _INCREMENTS, _STATUS, _EVENTS = range(1, 5)
+_WIRE, _INCREMENTS, _STATUS, _EVENTS, _CLOCK = range(1, 6)
 _STATUS_SCHEMA: Final = json.dumps({"type": "object"}).encode()
+_TIMEBASE_SCHEMA: Final = json.dumps(
+    {"type": "object", "properties": {name: {"type": "integer"} for name in Timebase._fields}}
+).encode()
 _EVENT_SCHEMA: Final = json.dumps({"type": "object", "properties": {"text": {"type": "string"}}}).encode()
 
 
@@ -259,19 +269,10 @@ class _Queue(Generic[T]):
         self._items: deque[T] = deque()
         self._put = self._taken = 0
 
-    def put(self, item: T) -> None:
-        """Append (in the loop); drop the oldest items above the limit."""
-        self._items.append(item)
-        self._put += self._size(item) + _OVERHEAD
-        self._drop()
-
-    def extend(self, items: Sequence[T]) -> None:
-        """Append several items (in the loop); drop the oldest above the limit."""
+    def put(self, *items: T) -> None:
+        """Append items (in the loop); drop the oldest above the limit."""
         self._items.extend(items)
         self._put += sum(map(self._size, items)) + _OVERHEAD * len(items)
-        self._drop()
-
-    def _drop(self) -> None:
         with suppress(IndexError):
             while self._put - self._taken - self.dropped_size - self.dropped * _OVERHEAD > QUEUE_BYTES:
                 self.dropped_size += self._size(self._items.popleft())
@@ -285,14 +286,6 @@ class _Queue(Generic[T]):
                 items.append(self._items.popleft())
         self._taken += sum(map(self._size, items)) + _OVERHEAD * len(items)
         return items
-
-
-def _bytes_size(arrival: Arrival) -> int:
-    return len(arrival.data)
-
-
-def _array_size(arrival: Arrival) -> int:
-    return arrival.data.nbytes  # type: ignore[union-attr]
 
 
 class _Staging(BytesIO):

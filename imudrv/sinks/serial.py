@@ -9,13 +9,11 @@ from typing import Final
 
 import serial
 
-from imudrv.errors import InputError
-from imudrv.files import settings_file
 from imudrv.ports.serial import explain
-from imudrv.ports.url import split, value
 from imudrv.profiles.schema import SerialLine
 from imudrv.sinks.backlog import Backlog
 from imudrv.sinks.base import Batch, Sink, SinkState
+from imudrv.url import device_path, serial_settings, split
 from imudrv.wire.datagram import SIZE
 
 BAUDRATE: Final = 921_600
@@ -43,7 +41,8 @@ class SerialSink(Sink):
 
     def __init__(self, url: str) -> None:
         super().__init__(url)
-        self._path, self._line = _parse(url)
+        parts = split(url)
+        self._path, self._settings = device_path(parts), serial_settings(parts, SerialLine(baudrate=BAUDRATE))
         self._backlog = Backlog(_PIECE)
         self._port: serial.Serial | None = None
         self._trouble = "not open yet"
@@ -93,17 +92,9 @@ class SerialSink(Sink):
         self._close_port()
 
     def _open(self) -> None:
-        parity = self._line.parity[0].upper()
         try:
             self._port = serial.Serial(
-                self._path,
-                self._line.baudrate,
-                self._line.bytesize,
-                parity,
-                self._line.stopbits,
-                timeout=0,
-                write_timeout=0,
-                exclusive=True,
+                self._path, **self._settings, timeout=0, write_timeout=0, exclusive=True
             )
         except OSError as error:
             self._trouble = explain(self._path, error)
@@ -127,14 +118,3 @@ class SerialSink(Sink):
         with suppress(OSError, termios.error):
             termios.tcflush(port.fileno(), termios.TCOFLUSH)  # otherwise closing may wait for a blocked line
         port.close()
-
-
-def _parse(url: str) -> tuple[str, SerialLine]:
-    parts = split(url)
-    if not parts.address.startswith("/"):
-        raise InputError(
-            f"{url}: expected the path of a device like serial:///dev/ttyUSB1 (three slashes), "
-            f"got {parts.address!r}"
-        )
-    options = {name: value(text) for name, text in parts.options.items()}
-    return parts.address, settings_file.parse({"baudrate": BAUDRATE, **options}, SerialLine, url)

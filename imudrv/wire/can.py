@@ -1,13 +1,17 @@
-"""CAN messages to frames: joins the messages of one sample and determines its full counter."""
+"""CAN messages to frames: joins the messages of one sample and determines its full counter.
+
+The messages of a sample have the same counter, or, where not all have one, follow each other in the order of
+the profile within half a sample interval.
+"""
 
 from typing import Final
 
 import numpy as np
 
 from imudrv.kernels import kernel
-from imudrv.records import FRAME, MAX_TEMPERATURES, NO_TEMPERATURE, REJECT, Reason, Records
-from imudrv.wire.fields import SLACK, Bytes, ahead_of, check_holds, fill, read
-from imudrv.wire.layout import MAX_MESSAGES, Layout
+from imudrv.records import FRAME, MAX_TEMPERATURES, REJECT, Reason, Records
+from imudrv.wire.fields import SLACK, Bytes, ahead_of, checks_hold, fill, hold, number
+from imudrv.wire.layout import MAX_MESSAGES, NARROW_BITS, Layout, SequenceKind
 from imudrv.wire.stream import Decoded
 from imudrv.wire.tables import Tables, layout_tables
 
@@ -17,6 +21,7 @@ LATE: Final = 64
 """A message at most this many samples before the newest is a duplicate; if older, the unit has restarted."""
 
 _MAX_LENGTH: Final = 64
+_EVER_NS: Final = 1 << 62
 _ROOM: Final = _MAX_LENGTH + SLACK
 
 CONSTANTS: Final = np.dtype(
@@ -25,6 +30,10 @@ CONSTANTS: Final = np.dtype(
         ("low_bits", np.int64),  # of the counter in these
         ("full_bits", np.int64),  # of the widest counter
         ("hold", np.int64),  # samples to wait for a full counter
+        ("late", np.int64),  # see `LATE`; 0 for a counter that wraps so soon that nothing counts as late
+        ("is_ordered", np.bool_),  # the messages of a sample belong together by their order
+        ("longest_ns", np.int64),  # from the first message of a sample to its last one
+        ("inverted", np.uint32),  # status before any was received: no bit applies
     ],
     align=True,
 )
@@ -34,6 +43,7 @@ SLOT: Final = np.dtype(
     [
         ("parts", np.int64),  # one bit for each kind that has come; 0: the slot is free
         ("begun", np.int64),  # index of the first message
+        ("begun_ns", np.int64),  # its time
         ("low", np.int64),  # low bits of the counter
         ("index", np.int64, MAX_MESSAGES),  # of the message of each kind
         ("data", np.uint8, (MAX_MESSAGES, _ROOM)),
@@ -45,6 +55,7 @@ SLOT: Final = np.dtype(
 STATE: Final = np.dtype(
     [
         ("index", np.int64),  # of the next message
+        ("source", np.int64),  # J1939 source address of the unit, once known; -1 before
         ("foreign", np.int64),  # counts since the beginning
         ("slow", np.int64),
         ("disagreements", np.int64),
@@ -62,6 +73,7 @@ STATE: Final = np.dtype(
 )
 """State that a call of the kernels leaves to the next."""
 
+_SOURCE: Final = 0xFF
 _NO_FRAMES: Final = np.zeros(0, FRAME)
 _NO_REJECTS: Final = np.zeros(0, REJECT)
 _SOUND: Final = 0
@@ -97,7 +109,7 @@ class CanAssembler:
     def __init__(self, layout: Layout) -> None:
         self._tables = layout_tables(layout)
         self._constants = _constants(layout, self._tables[0])
-        self._parts = sum(kind.every == 1 for kind in layout.messages)
+        self._parts = sum(kind.is_part for kind in layout.messages)
         self._slots = np.zeros(OPEN_SAMPLES, SLOT)
         self._held = _NO_FRAMES
         self._state = np.zeros(1, STATE)
@@ -175,13 +187,20 @@ class CanAssembler:
 
 
 def _constants(layout: Layout, kinds: Records) -> Records:
-    parts, every = kinds["in_every_sample"], [message.every for message in layout.messages]
-    low_bits = kinds["counter_bits"][parts][0]
-    has_full_counter = kinds["counter_bits"] > low_bits
+    parts, every = kinds["part"] >= 0, [message.every for message in layout.messages]
+    bits = np.where(layout.sequence.kind == SequenceKind.COUNTER, kinds["sequence"]["bits"], 0)
+    low_bits = bits[parts].max(initial=0)
+    has_full_counter = bits > low_bits
     constants = np.zeros(1, CONSTANTS)
     constants["all_parts"] = sum(1 << k for k in np.flatnonzero(parts).tolist())
-    constants["low_bits"], constants["full_bits"] = low_bits, kinds["counter_bits"].max()
-    constants["hold"] = np.max(2 * np.array(every) * has_full_counter)
+    constants["low_bits"], constants["full_bits"] = low_bits, bits.max()
+    constants["hold"] = np.max(2 * np.array(every) * has_full_counter) if low_bits else 0
+    constants["late"] = LATE if low_bits >= NARROW_BITS else 0
+    constants["is_ordered"] = layout.is_ordered or not low_bits
+    # Half of the time until another sample could be meant.
+    period = 1 if constants["is_ordered"][0] else (1 << int(low_bits)) / layout.sequence.step
+    constants["longest_ns"] = min(int(period * layout.interval / 2), _EVER_NS)
+    constants["inverted"] = layout.status.inverted
     return constants
 
 
@@ -204,52 +223,79 @@ def _assemble(
         Frames that may go out; these and the held ones; rejects.
     """
     # Out of the tuple once: each access inside the loop would count references.
-    kinds, fields, fixed_bytes = tables
+    kinds, fields, multiplexed, fixed_bytes, checks = tables
     c, s = constants[0], state[0]
     s["released"], s["found"], s["rejected"] = 0, held, 0
     data = np.zeros(_ROOM, np.uint8)
     for i in range(messages.shape[0]):
         message = messages[np.uint64(i)]
-        k = _kind_of(message["id"], kinds)
+        k = _kind_of(message, kinds, fixed_bytes, s)
         if k < 0:
             s["foreign"] += 1
         else:
             kind = kinds[np.uint64(k)]
-            fault = _fault(message, data, kind, fixed_bytes)
+            fault = _fault(message, data, kind, fixed_bytes, checks)
             if fault != _SOUND:
                 s["damaged"] += 1
                 _reject(s["index"], fault, s, rejects)
-            elif not kind["in_every_sample"]:
-                _take_slow(data, kind, fields, c, s, frames)
+            elif kind["part"] < 0:
+                s["slow"] += 1
+                if not kind["is_skipped"]:
+                    _take_slow(data, kind, fields, multiplexed, c, s, frames)
             else:
-                complete = _take_part(data, k, kind, c, s, slots, rejects)
+                if c["is_ordered"]:
+                    complete = _take_in_order(data, k, kind, message["t_ns"], c, s, slots, rejects)
+                else:
+                    complete = _take_part(data, k, kind, message["t_ns"], c, s, slots, rejects)
                 if complete >= 0:
-                    _advance(slots[complete]["low"], c, s)
-                    _make_frame(frames, slots[complete], message["t_ns"], kinds, fields, s)
+                    if not c["is_ordered"]:
+                        _advance(slots[complete]["low"], c, s)
+                    _make_frame(frames, slots[complete], message["t_ns"], kinds, fields, multiplexed, c, s)
                     _release(c, s)
         s["index"] += 1
     return s["released"], s["found"], s["rejected"]
 
 
 @kernel
-def _kind_of(identifier: int, kinds: Records) -> int:
-    """Return the row of the kind with this identifier; -1 for an unknown one."""
+def _kind_of(message: np.void, kinds: Records, fixed_bytes: Records, s: np.void) -> int:
+    """Return the row of the kind with this identifier and these constants; -1 for an unknown identifier.
+
+    Where any source address is possible, that of the first message is the unit's.
+    """
+    identifier, best = np.int64(message["id"]), -1
     for k in range(kinds.shape[0]):
-        if kinds[np.uint64(k)]["can_id"] == identifier:
+        kind = kinds[np.uint64(k)]
+        if identifier & kind["can_mask"] != kind["can_id"]:
+            continue
+        if kind["can_mask"] & _SOURCE == 0:
+            if s["source"] < 0:
+                s["source"] = identifier & _SOURCE
+            if identifier & _SOURCE != s["source"]:
+                continue
+        if _has_constants(message["data"], kind, fixed_bytes):
             return k
-    return -1
+        if best < 0:
+            best = k
+    return best
 
 
 @kernel
-def _fault(message: np.void, data: Bytes, kind: np.void, fixed_bytes: Records) -> int:
+def _has_constants(data: Bytes, kind: np.void, fixed_bytes: Records) -> bool:
+    for f in range(kind["first_constant"], kind["end_constant"]):
+        if data[fixed_bytes[f]["offset"]] != fixed_bytes[f]["value"]:
+            return False
+    return True
+
+
+@kernel
+def _fault(message: np.void, data: Bytes, kind: np.void, fixed_bytes: Records, checks: Records) -> int:
     """Copy the bytes of a message to `data`; return why they are not of this kind, or `_SOUND`."""
     if message["length"] != kind["length"]:
         return _WRONG_LENGTH
     _copy(message["data"], data, kind["length"])
-    for f in range(kind["first_constant"], kind["end_constant"]):
-        if data[fixed_bytes[f]["offset"]] != fixed_bytes[f]["value"]:
-            return _CHECK_FAILED
-    return _SOUND if check_holds(data, 0, kind) else _CHECK_FAILED
+    if _has_constants(data, kind, fixed_bytes) and checks_hold(data, 0, kind, checks):
+        return _SOUND
+    return _CHECK_FAILED
 
 
 @kernel
@@ -259,11 +305,18 @@ def _copy(source: Bytes, target: Bytes, length: int) -> None:
 
 
 @kernel
-def _take_slow(data: Bytes, kind: np.void, fields: Records, c: np.void, s: np.void, frames: Records) -> None:
+def _take_slow(
+    data: Bytes,
+    kind: np.void,
+    fields: Records,
+    multiplexed: Records,
+    c: np.void,
+    s: np.void,
+    frames: Records,
+) -> None:
     """Take a message that does not come with every sample; a full counter releases the held frames."""
-    s["slow"] += 1
-    fill(data, 0, kind, fields, s["latest"])
-    if kind["counter_bits"] > c["low_bits"]:
+    fill(data, 0, kind, fields, multiplexed, s["latest"])
+    if kind["sequence"]["bits"] > c["low_bits"] > 0:
         correction = _anchor(s["latest"]["counter"], c, s)
         for f in range(s["released"], s["found"]):
             frames[f]["counter"] = _wrapped(frames[f]["counter"] + correction, c)
@@ -288,32 +341,70 @@ def _anchor(full: int, c: np.void, s: np.void) -> int:
 
 @kernel
 def _take_part(
-    data: Bytes, k: int, kind: np.void, c: np.void, s: np.void, slots: Records, rejects: Records
+    data: Bytes, k: int, kind: np.void, t_ns: int, c: np.void, s: np.void, slots: Records, rejects: Records
 ) -> int:
     """Take a message that comes with every sample; return the slot that it completes, or -1."""
-    low = read(data, kind["counter_offset"], c["low_bits"], False, kind["big_endian"])
-    ahead = ahead_of(low, s["counter"], c["low_bits"]) if s["has_sample"] else 1
-    if ahead < -LATE:
+    low = number(data, 0, kind["sequence"])
+    ahead = ahead_of(low, s["counter"], c["low_bits"]) if s["has_sample"] and c["late"] else 1
+    if ahead < -c["late"]:
         _restart(c, s, slots, rejects)
     at = _slot_of(low, slots)
     slot, part = slots[at], np.int64(1) << k
     is_open = slot["parts"] != 0 and slot["low"] == low
-    if -LATE <= ahead <= 0 or (is_open and slot["parts"] & part):
+    if is_open and not c["late"] and _is_late(t_ns, slot, c):
+        _give_up(slot, s, rejects)
+        is_open = False
+    if -c["late"] <= ahead <= 0 or (is_open and slot["parts"] & part):
         _reject(s["index"], _STALE, s, rejects)
         return -1
     if not is_open:
         _give_up(slot, s, rejects)
-        slot["begun"], slot["low"] = s["index"], low
-    slot["parts"] |= part
-    slot["index"][k] = s["index"]
-    _copy(data, slot["data"][k], kind["length"])
-    if slot["parts"] != c["all_parts"]:
+        slot["begun"], slot["low"], slot["begun_ns"] = s["index"], low, t_ns
+    if not _is_complete_with(data, k, kind, slot, c, s):
         return -1
-    slot["parts"] = 0
     for other in range(OPEN_SAMPLES):
         if ahead_of(slots[other]["low"], low, c["low_bits"]) < 0:
             _give_up(slots[other], s, rejects)
     return at
+
+
+@kernel
+def _take_in_order(
+    data: Bytes, k: int, kind: np.void, t_ns: int, c: np.void, s: np.void, slots: Records, rejects: Records
+) -> int:
+    """Take a message that follows the one before it in the sample; return the slot that it completes, or -1.
+
+    `low` of the slot is the number of messages that have come.
+    """
+    slot = slots[0]
+    if slot["parts"] and (kind["part"] != slot["low"] or _is_late(t_ns, slot, c)):
+        _give_up(slot, s, rejects)
+    if slot["parts"] == 0:
+        if kind["part"]:
+            s["torn"] += 1
+            _reject(s["index"], _TORN, s, rejects)
+            return -1
+        slot["begun"], slot["low"], slot["begun_ns"] = s["index"], 0, t_ns
+    slot["low"] += 1
+    return 0 if _is_complete_with(data, k, kind, slot, c, s) else -1
+
+
+@kernel
+def _is_late(t_ns: int, slot: np.void, c: np.void) -> bool:
+    """Whether a message is of a later sample, by its time if that is known."""
+    return bool(t_ns != 0 and slot["begun_ns"] != 0 and t_ns - slot["begun_ns"] > c["longest_ns"])
+
+
+@kernel
+def _is_complete_with(data: Bytes, k: int, kind: np.void, slot: np.void, c: np.void, s: np.void) -> bool:
+    """Put a message into its slot; return whether that completes the sample, and free the slot then."""
+    slot["parts"] |= np.int64(1) << k
+    slot["index"][k] = s["index"]
+    _copy(data, slot["data"][k], kind["length"])
+    if slot["parts"] != c["all_parts"]:
+        return False
+    slot["parts"] = 0
+    return True
 
 
 @kernel
@@ -331,16 +422,27 @@ def _slot_of(low: int, slots: Records) -> int:
 
 @kernel
 def _make_frame(
-    frames: Records, slot: np.void, t_ns: int, kinds: Records, fields: Records, s: np.void
+    frames: Records,
+    slot: np.void,
+    t_ns: int,
+    kinds: Records,
+    fields: Records,
+    multiplexed: Records,
+    c: np.void,
+    s: np.void,
 ) -> None:
     """Make the next frame of a complete sample and of what holds since earlier messages."""
     frames[s["found"]] = s["latest"]
     frame = frames[s["found"]]
     for k in range(kinds.shape[0]):
         kind = kinds[np.uint64(k)]
-        if kind["in_every_sample"]:
-            fill(slot["data"][np.uint64(k)], 0, kind, fields, frame)
-    frame["counter"], frame["offset"], frame["t_ns"] = s["counter"], s["index"], t_ns
+        if kind["part"] >= 0:
+            fill(slot["data"][np.uint64(k)], 0, kind, fields, multiplexed, frame)
+    if multiplexed.shape[0]:
+        hold(frame, s["latest"])
+    if not c["is_ordered"]:
+        frame["counter"] = s["counter"]
+    frame["offset"], frame["t_ns"] = s["index"], t_ns
     frame["damaged"], frame["torn"] = s["damaged"], s["torn"]
     s["damaged"] = s["torn"] = 0
     s["found"] += 1
@@ -375,9 +477,10 @@ def _restart(c: np.void, s: np.void, slots: Records, rejects: Records) -> None:
 def _forget(c: np.void, s: np.void) -> None:
     """Reset the state of the unit; counts stay."""
     s["counter"], s["has_sample"], s["is_anchored"] = 0, False, c["hold"] == 0
-    s["latest"]["status"] = 0
+    s["source"] = -1
+    s["latest"]["status"] = c["inverted"]
     for channel in range(MAX_TEMPERATURES):
-        s["latest"]["temperature"][channel] = NO_TEMPERATURE
+        s["latest"]["temperature"][channel] = np.nan
 
 
 @kernel

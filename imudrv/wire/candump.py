@@ -3,7 +3,8 @@
     (1700000000.123456) can0 150#0001FFFF02004000            classic, id of 3 or 8 hex digits
     (1700000000.123456) can0 158##1000102...                 CAN FD: ``##`` and one digit of flags
 
-A record holds the number of an identifier, not whether it was sent with 11 or 29 bits.
+An identifier of 8 digits has 29 bits, one of 3 digits 11. An error frame (`candump -e`) has bit 29 of its
+identifier set: 20000004.
 """
 
 from typing import Final, NamedTuple
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from imudrv.errors import InputError
 from imudrv.kernels import kernel
-from imudrv.records import MESSAGE, REJECT, Reason, Records
+from imudrv.records import EXTENDED, MESSAGE, REJECT, Reason, Records
 from imudrv.units import NS_PER_S
 from imudrv.wire.fields import Bytes
 
@@ -27,8 +28,12 @@ _OPEN, _CLOSE, _POINT, _HASH, _ZERO = ord("("), ord(")"), ord("."), ord("#"), or
 _RECEIVED, _TRANSMITTED = ord("R"), ord("T")
 _NOT_HEX: Final = 255
 _NO_MESSAGE: Final = -1
+_IS_ERROR_FRAME: Final = -2
+_ERROR_FLAG: Final = 1 << 29
+_ID_MASK: Final = _ERROR_FLAG - 1
 _LAST_SECOND: Final = (2**63 - 1) // NS_PER_S - 1
 _NOT_A_MESSAGE: Final = int(Reason.NOT_A_MESSAGE)
+_ERROR_FRAME: Final = int(Reason.ERROR_FRAME)
 
 _NIBBLES = np.full(256, _NOT_HEX, np.uint8)
 for _value, _digit in enumerate(b"0123456789ABCDEF"):
@@ -41,7 +46,7 @@ class CandumpDecoder:
 
     The messages and rejects are the same for any cut of the text into pieces, and every byte fed is in the
     line of a message, in a blank line, in a reject (its line, whole) or among the `pending` ones. Remote
-    frames carry no data and are rejects.
+    frames carry no data and are rejects; error frames are rejects with a reason of their own.
 
     Only the messages of one channel come out, so that two units in one log are never mixed; `check_channel`
     refuses a log of several channels where none was chosen.
@@ -158,7 +163,7 @@ class CandumpDecoder:
         self._is_closed = True
         self._offset -= 1
         rejects["length"] -= 1
-        rejects["reason"] = Reason.UNFINISHED
+        rejects["reason"][rejects["reason"] == Reason.NOT_A_MESSAGE] = Reason.UNFINISHED
         return messages, rejects
 
 
@@ -193,7 +198,7 @@ def _scan(
             elif text[_skip_blanks(text, start)] != _NEWLINE or end - start > LONGEST_LINE:
                 rejects[rejected]["offset"] = start
                 rejects[rejected]["length"] = end + 1 - start
-                rejects[rejected]["reason"] = _NOT_A_MESSAGE
+                rejects[rejected]["reason"] = _ERROR_FRAME if row == _IS_ERROR_FRAME else _NOT_A_MESSAGE
                 rejected += 1
         start = end + 1
     counts[0] += found
@@ -205,7 +210,7 @@ def _parse(text: Bytes, p: int, message: np.void, names: Bytes) -> int:
     """Read the line at `p` into `message`, whose data are zeros; no step passes the newline of the line.
 
     Returns 0 for a message of the channel that is read, the position of the channel name for a message of
-    another channel, and `_NO_MESSAGE` otherwise.
+    another channel, `_IS_ERROR_FRAME` for an error frame, and `_NO_MESSAGE` otherwise.
     """
     p = _parse_time(text, p, message)
     if p == _NO_MESSAGE:
@@ -226,6 +231,8 @@ def _parse(text: Bytes, p: int, message: np.void, names: Bytes) -> int:
         end_of_data = _skip_blanks(text, end_of_data + 1)
     if text[end_of_data] != _NEWLINE:
         return _NO_MESSAGE
+    if message["id"] & _ERROR_FLAG:
+        return _IS_ERROR_FRAME
     return 0 if _is_name(text, channel, end - channel, names[0]) else channel
 
 
@@ -254,10 +261,10 @@ def _parse_identifier(text: Bytes, begin: int, message: np.void) -> int:
     while p < begin + 8 and _NIBBLES[text[p]] != _NOT_HEX:
         identifier = identifier << 4 | np.int64(_NIBBLES[text[p]])
         p += 1
-    limit = 0x7FF if p - begin == 3 else 0x1FFFFFFF
+    limit = 0x7FF if p - begin == 3 else _ERROR_FLAG | _ID_MASK
     if (p - begin != 3 and p - begin != 8) or identifier > limit or text[p] != _HASH:
         return _NO_MESSAGE
-    message["id"] = identifier
+    message["id"] = identifier if p - begin == 3 else identifier | EXTENDED
     return p + 1
 
 
@@ -392,7 +399,7 @@ def _write(messages: Records, name: Bytes, text: Bytes) -> int:
         for k in range(name.shape[0]):
             p = _put(text, p, name[k])
         p = _put(text, p, _SPACE)
-        p = _put_hex(text, p, message["id"], 3 if message["id"] <= 0x7FF else 8)
+        p = _put_hex(text, p, message["id"] & _ID_MASK, 3 if message["id"] <= 0x7FF else 8)
         p = _put(text, p, _HASH)
         if message["fd"]:
             p = _put(text, p, _HASH)

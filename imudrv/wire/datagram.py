@@ -1,5 +1,6 @@
 """The output datagram `I50N`, version 1: 76 bytes per sample, one or more in a packet (ICD, section 7)."""
 
+from fractions import Fraction
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -7,8 +8,8 @@ from numpy.typing import NDArray
 
 from imudrv.kernels import kernel
 from imudrv.records import INCREMENTS, Records, Source
-from imudrv.wire.check import compute
-from imudrv.wire.layout import Check, CheckKind, Layout, Message
+from imudrv.wire.check import compute_plain
+from imudrv.wire.layout import SEQUENCE, Check, CheckKind, Field, Layout, Message, Sequence, SequenceKind
 from imudrv.wire.stream import StreamDecoder
 from imudrv.wire.tables import layout_tables
 
@@ -66,7 +67,7 @@ def encode(increments: Records, source: Source) -> bytes:
 @kernel
 def _fill(increments: Records, data: NDArray[np.uint8], rows: Records, source: int, kinds: Records) -> None:
     """Write datagrams; `rows`, shape (n, 1), and `data` are the same memory."""
-    check = kinds[0]["check"]
+    check = kinds[0]["plain_check"]
     for i in range(increments.shape[0]):
         sample, row, out = increments[i], rows[i, 0], data[i]
         for k in range(len(MAGIC)):
@@ -76,7 +77,7 @@ def _fill(increments: Records, data: NDArray[np.uint8], rows: Records, source: i
         row["interval_ns"], row["t_ns"] = sample["interval_ns"], sample["t_ns"]
         for k in range(3):
             row["dtheta_b"][k], row["dv_b"][k] = sample["dtheta_b"][k], sample["dv_b"][k]
-        row["crc"] = np.uint32(compute(out, 0, check))
+        row["crc"] = np.uint32(compute_plain(out, 0, check))
 
 
 class Received(NamedTuple):
@@ -97,21 +98,29 @@ class Received(NamedTuple):
     rejects: Records
 
 
+_CHECK: Final = Check(
+    CheckKind.CRC_REFLECTED,
+    32,
+    ((0, _CHECKED),),
+    _CHECKED,
+    polynomial=0x04C11DB7,
+    init=0xFFFFFFFF,
+    xor_out=0xFFFFFFFF,
+)
+
+
 _LAYOUT: Final = Layout(
     name="I50N",
     can=False,
     fd=False,
-    big_endian=False,
-    interval_ns=1_000_000,
-    totals=False,
-    counter_bits=32,
-    pulse_bits=32,
+    interval=Fraction(1_000_000),
+    sequence=Sequence(SequenceKind.COUNTER, 32),
     messages=(
         Message(
             SIZE,
-            (),
-            (*enumerate(MAGIC), (4, VERSION)),
-            Check(CheckKind.CRC_REFLECTED, 32, 0, _CHECKED, _CHECKED, 0x04C11DB7, 0xFFFFFFFF, 0xFFFFFFFF),
+            fields=(Field(SEQUENCE, 8, 4, bits=32),),
+            constants=(*enumerate(MAGIC), (4, VERSION)),
+            checks=(_CHECK,),
         ),
     ),
 )

@@ -1,11 +1,12 @@
 """Decoder from wire data to frames by profile, with counts of rejected input."""
 
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from imudrv.records import Reason, Records
+from imudrv.records import MESSAGE, Reason, Records
 from imudrv.wire.can import CanAssembler
 from imudrv.wire.candump import CandumpDecoder
 from imudrv.wire.layout import Layout
@@ -65,6 +66,37 @@ class FrameDecoder:
             frames, rejects = self._decoder.feed(data, t_ns)
         else:
             raise TypeError("expected CAN messages for a CAN profile, bytes for any other")
+        if rejects.size:
+            self.count_rejects(rejects)
+        return frames
+
+    def feed_reads(
+        self,
+        data: NDArray[Any],
+        ends: NDArray[np.int64],
+        times: NDArray[np.int64],
+    ) -> Records:
+        """Decode several reads at once; the frames are those of feeding one read after the other.
+
+        Parameters
+        ----------
+        data : ndarray of uint8 or of MESSAGE
+            All their bytes, or for a CAN profile messages.
+        ends : ndarray of int64, shape (n,)
+            Where each read ends in the data; the last one at their end.
+        times : ndarray of int64, shape (n,)
+            Time of arrival of each read; messages have their own.
+
+        Returns
+        -------
+        ndarray of FRAME
+            The frames that became complete.
+        """
+        if data.dtype == MESSAGE:
+            return self.feed(data)
+        if not isinstance(self._decoder, StreamDecoder):
+            raise TypeError("expected CAN messages for a CAN profile, got bytes")
+        frames, rejects = self._decoder.feed_reads(data, ends, times)
         if rejects.size:
             self.count_rejects(rejects)
         return frames

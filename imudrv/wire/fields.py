@@ -1,6 +1,6 @@
 """Bytes of one message to the numbers of one FRAME record, driven by the profile's field table.
 
-Every kernel may read three bytes past the end of the message: buffers keep `SLACK` spare bytes.
+Every kernel may read seven bytes past the end of the message: buffers keep `SLACK` spare bytes.
 """
 
 from typing import Final
@@ -9,18 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imudrv.kernels import kernel
-from imudrv.records import Records
-from imudrv.wire.check import compute
-from imudrv.wire.layout import ACCELEROMETER, COUNTER, GYRO, STATUS, TEMPERATURE, CheckKind
+from imudrv.records import MAX_TEMPERATURES, Records
+from imudrv.wire.check import compute, compute_plain
+from imudrv.wire.layout import ACCELEROMETER, GYRO, SEQUENCE, STATUS, TEMPERATURE
 
 Bytes = NDArray[np.uint8]
 
-SLACK: Final = 4
-"""Spare bytes after the last message of a buffer: a number is read as four bytes whatever its width."""
+SLACK: Final = 8
+"""Spare bytes after the last message of a buffer: a number is read as four or eight bytes."""
 
 
 @kernel
-def read(data: Bytes, p: int, bits: int, signed: bool, big_endian: bool) -> int:
+def short_number(data: Bytes, p: int, bits: int, signed: bool, big_endian: bool) -> int:
     """Read the number of `bits` (8, 16, 24, 32) at `p`, as int64."""
     four = data[np.uint64(p) : np.uint64(p + 4)]
     b0, b1, b2, b3 = np.int64(four[0]), np.int64(four[1]), np.int64(four[2]), np.int64(four[3])
@@ -35,36 +35,123 @@ def read(data: Bytes, p: int, bits: int, signed: bool, big_endian: bool) -> int:
 
 
 @kernel
+def word(data: Bytes, p: int, size: int, big_endian: bool) -> int:
+    """Read the word of `size` bytes (1 to 8) at `p`, as int64; those of 8 bytes keep their bits."""
+    if size <= 4:
+        return short_number(data, p, 8 * size, False, big_endian)
+    value = 0
+    for k in range(size):
+        value = value << 8 | int(data[np.uint64(p + (k if big_endian else size - 1 - k))])
+    return int(value)
+
+
+@kernel
+def number(data: Bytes, p: int, field: np.void) -> int:
+    """Read a field of the message at `p`, as it is on the wire; a floating-point number as its bits."""
+    value = word(data, p + field["offset"], field["size"], field["big_endian"])
+    spare = 64 - field["bits"]
+    if field["signed"]:
+        return int(value << (spare - field["shift"]) >> spare)
+    return int(value >> field["shift"] & ~(np.int64(-1) << (64 - spare)) if spare else value)
+
+
+@kernel
+def real(bits: int, size: int) -> float:
+    """Return the floating-point number of 4 or 8 bytes with these bits."""
+    if size == 4:
+        return float(np.uint32(bits).view(np.float32))
+    return float(np.int64(bits).view(np.float64))
+
+
+@kernel
 def ahead_of(counter: int | np.int64, other: int | np.int64, bits: int) -> int:
     """By how much the low `bits` of `counter` are ahead of those of `other`, as a signed number of `bits`."""
     return int((counter - other) << (64 - bits) >> (64 - bits))
 
 
 @kernel
-def check_holds(data: Bytes, p: int, kind: np.void) -> bool:
-    """Whether the message at `p` carries the check value of its bytes."""
-    check = kind["check"]
-    carried = read(data, p + check["offset"], check["width"], False, kind["big_endian"])
+def plain_check_holds(data: Bytes, p: int, kind: np.void) -> bool:
+    """Whether the message at `p` carries the value of its plain check, if it has one."""
+    check = kind["plain_check"]
+    carried = short_number(data, p + check["offset"], check["width"], False, check["big_endian"])
     # Computed even where there is none: a branch around it would count references to the arrays.
-    return bool((carried == compute(data, p, check)) | (check["kind"] == CheckKind.NONE))
+    return bool((carried == compute_plain(data, p, check)) | (check["kind"] == 0))
 
 
 @kernel
-def fill(data: Bytes, p: int, kind: np.void, fields: Records, frame: np.void) -> None:
+def checks_hold(data: Bytes, p: int, kind: np.void, checks: Records) -> bool:
+    """Whether the message at `p` carries the values of all its checks."""
+    if not plain_check_holds(data, p, kind):
+        return False
+    for c in range(np.uint64(kind["first_check"]), np.uint64(kind["end_check"])):
+        check = checks[c]
+        if word(data, p + check["offset"], check["size"], check["big_endian"]) != compute(data, p, check):
+            return False
+    return True
+
+
+@kernel
+def fill(data: Bytes, p: int, kind: np.void, fields: Records, multiplexed: Records, frame: np.void) -> None:
     """Read every field of the message at `p` into `frame`; other members keep their values."""
-    big_endian = kind["big_endian"]
     # Unsigned indices spare numba's test for negative ones.
-    for f in range(np.uint64(kind["first_field"]), np.uint64(kind["end_field"])):
+    for f in range(np.uint64(kind["first_field"]), np.uint64(kind["end_plain"])):
         field = fields[f]
-        target = field["target"]
-        value = read(data, p + field["offset"], field["bits"], field["signed"], big_endian)
-        if target == COUNTER:
-            frame["counter"] = value
-        elif target < ACCELEROMETER:
-            frame["gyro"][np.uint64(target - GYRO)] = np.int32(value)
-        elif target < STATUS:
-            frame["accelerometer"][np.uint64(target - ACCELEROMETER)] = np.int32(value)
-        elif target == STATUS:
-            frame["status"] = np.uint32(value)
+        at, is_big = p + field["offset"], field["big_endian"]
+        _put(short_number(data, at, field["bits"], field["signed"], is_big), field["target"], frame)
+    for f in range(np.uint64(kind["end_plain"]), np.uint64(kind["end_field"])):
+        _fill_field(data, p, fields[f], frame)
+    for f in range(np.uint64(kind["first_multiplexed"]), np.uint64(kind["end_multiplexed"])):
+        some = multiplexed[f]
+        selected = number(data, p, some["selector"])
+        if (selected % some["modulo"] if some["modulo"] else selected) == some["value"]:
+            _fill_field(data, p, some["field"], frame)
+
+
+@kernel
+def hold(frame: np.void, latest: np.void) -> None:
+    """Keep status and temperatures for the next frame, which may come without them."""
+    latest["status"] = frame["status"]
+    for channel in range(MAX_TEMPERATURES):
+        latest["temperature"][channel] = frame["temperature"][channel]
+
+
+@kernel
+def _fill_field(data: Bytes, p: int, field: np.void, frame: np.void) -> None:
+    target = field["target"]
+    value = number(data, p, field)
+    if field["is_float"]:
+        x = real(value, field["size"])
+        if target == SEQUENCE:
+            value = _ticks(x * field["ticks"])
+        elif target >= TEMPERATURE:
+            frame["temperature"][np.uint64(target - TEMPERATURE)] = x
+            return
         else:
-            frame["temperature"][np.uint64(target - TEMPERATURE)] = np.int32(value)
+            value = int(np.float64(field["sign"] * (x - field["zero"])).view(np.int64))
+    else:
+        value = field["sign"] * (value - field["zero"])
+    if target == STATUS:
+        mask = ~(np.int64(-1) << field["bits"]) << field["place"]
+        value = int(frame["status"] & ~mask | value << field["place"])
+    _put(value, target, frame)
+
+
+@kernel
+def _put(value: int, target: int, frame: np.void) -> None:
+    """Set a number of a frame."""
+    if target == SEQUENCE:
+        frame["counter"] = value
+    elif target < ACCELEROMETER:
+        frame["gyro"][np.uint64(target - GYRO)] = value
+    elif target < STATUS:
+        frame["accelerometer"][np.uint64(target - ACCELEROMETER)] = value
+    elif target == STATUS:
+        frame["status"] = np.uint32(value)
+    else:
+        frame["temperature"][np.uint64(target - TEMPERATURE)] = value
+
+
+@kernel
+def _ticks(x: float) -> int:
+    """Round a time to whole ticks; a message may hold any number, infinity and NaN among them."""
+    return int(np.int64(np.rint(x))) if abs(x) < 2.0**62 else 0

@@ -1,4 +1,8 @@
-"""A byte stream to frames: finds them, checks them, and returns every other byte with a reason."""
+"""A byte stream to frames: finds messages, checks them, and returns every other byte with a reason.
+
+Most units send one kind of message, which is a frame. Where a sample comes in several messages, these follow
+each other in the profile's order with nothing between them: that alone tells that they belong together.
+"""
 
 from typing import Final, NamedTuple
 
@@ -7,8 +11,8 @@ from numpy.typing import NDArray
 
 from imudrv.kernels import kernel
 from imudrv.records import FRAME, REJECT, Reason, Records
-from imudrv.wire.fields import SLACK, check_holds, fill
-from imudrv.wire.layout import Layout
+from imudrv.wire.fields import SLACK, checks_hold, fill, hold, plain_check_holds
+from imudrv.wire.layout import MAX_MESSAGES, Layout
 from imudrv.wire.tables import Tables, layout_tables
 
 STATE: Final = np.dtype(
@@ -17,6 +21,15 @@ STATE: Final = np.dtype(
         ("reject_offset", np.int64),  # where the run of rejected bytes begins that is still open; -1: none
         ("reject_reason", np.int64),
         ("skipped", np.int64),  # rejected bytes since the last frame
+        # of a unit with several kinds of message:
+        ("torn", np.int64),  # samples given up since the last frame
+        ("parts", np.int64),  # messages of the open sample
+        ("part_end", np.int64),  # where the last one of them ends in the stream
+        ("part_offset", np.int64, MAX_MESSAGES),
+        ("part_length", np.int64, MAX_MESSAGES),
+        ("sample", FRAME),  # the open sample
+        ("latest", FRAME),  # what the other messages said last
+        ("others", np.int64),  # good messages that are no part of a sample
     ],
     align=True,
 )
@@ -24,6 +37,7 @@ STATE: Final = np.dtype(
 
 _NO_SYNC: Final = int(Reason.NO_SYNC)
 _CHECK_FAILED: Final = int(Reason.CHECK_FAILED)
+_TORN: Final = int(Reason.TORN)
 _REJECTS_AT_ONCE: Final = 1024
 _NO_REJECTS: Final = np.zeros(0, REJECT)
 
@@ -47,7 +61,8 @@ class StreamDecoder:
     """Decoder of a byte stream; feed it bytes as they arrive, in any pieces.
 
     The frames and rejects are the same for any cut of the stream into pieces, and every byte fed is in a
-    frame, in a reject, or among the `pending` ones. After a bad frame the search resumes at its second byte.
+    frame, in a reject, in a good message that is no part of a sample, or among the `pending` ones. After a
+    bad message the search resumes at its second byte.
 
     Parameters
     ----------
@@ -57,22 +72,37 @@ class StreamDecoder:
 
     def __init__(self, layout: Layout) -> None:
         self._tables = layout_tables(layout)
-        self._length = layout.messages[0].length
+        self._length = sum(message.length for message in layout.messages if message.is_part)
+        only = layout.messages[0]
+        is_usual = (
+            len(layout.messages) == 1 and not only.multiplexed and only.checks in ((), (only.plain_check,))
+        )
+        self._walk = _scan if is_usual else _scan_kinds
         self._buffer: NDArray[np.uint8] = np.zeros(self._length + SLACK, np.uint8)
         self._pending = 0
         self._state = np.zeros(1, STATE)
         self._state["reject_offset"] = -1
+        self._state["latest"]["status"] = layout.status.inverted
+        self._state["latest"]["temperature"] = np.nan
         self._rejects = np.zeros(_REJECTS_AT_ONCE, REJECT)
+        self._end: NDArray[np.int64] = np.zeros(1, np.int64)  # of the one read of `feed`
+        self._time: NDArray[np.int64] = np.zeros(1, np.int64)
 
     @property
     def pending(self) -> int:
-        """Number of bytes of an incomplete frame."""
-        return self._pending
+        """Number of bytes of an incomplete message, and of the messages of an incomplete sample."""
+        s = self._state[0]
+        return self._pending + int(s["part_length"][: s["parts"]].sum())
 
     @property
     def bytes_fed(self) -> int:
         """Number of bytes fed so far."""
         return int(self._state[0]["offset"]) + self._pending
+
+    @property
+    def others(self) -> int:
+        """Number of bytes of good messages that are no part of a sample."""
+        return int(self._state[0]["others"])
 
     def feed(self, data: bytes | bytearray | memoryview | NDArray[np.uint8], t_ns: int = 0) -> Decoded:
         """Decode bytes.
@@ -90,22 +120,61 @@ class StreamDecoder:
             Frames and rejects that they complete.
         """
         piece = np.frombuffer(data, np.uint8)
+        self._end[0], self._time[0] = piece.size, t_ns
+        return self._feed(piece, self._end, self._time)
+
+    def feed_reads(
+        self,
+        data: NDArray[np.uint8],
+        ends: NDArray[np.int64],
+        times: NDArray[np.int64],
+    ) -> Decoded:
+        """Decode the bytes of several reads; the result is that of feeding one read after the other.
+
+        Parameters
+        ----------
+        data : ndarray of uint8
+            All bytes.
+        ends : ndarray of int64, shape (n,)
+            Where each read ends in them; the last one at their end.
+        times : ndarray of int64, shape (n,)
+            Time of arrival of each read, host clock, ns.
+
+        Returns
+        -------
+        Decoded
+            Frames and rejects that they complete.
+        """
+        if len(ends) != len(times) or (ends[-1] if len(ends) else 0) != data.size:
+            raise ValueError(f"expected an end and a time a read, the last end {data.size}")
+        return self._feed(data, ends, times)
+
+    def _feed(self, piece: NDArray[np.uint8], ends: NDArray[np.int64], times: NDArray[np.int64]) -> Decoded:
         stop = self._pending + piece.size
         if stop + SLACK > self._buffer.size:
             grown = np.zeros(stop + SLACK, np.uint8)
             grown[: self._pending] = self._buffer[: self._pending]
             self._buffer = grown
         self._buffer[self._pending : stop] = piece
-        frames = room = np.zeros(stop // self._length, FRAME)
+        frames = room = np.zeros(stop // self._length + 1, FRAME)
         rejects: list[Records] = []
-        position = 0
+        position = read = 0
         while True:
-            position, found, rejected, is_done = _scan(
-                self._buffer, position, stop, t_ns, self._tables, self._state, room, self._rejects
+            position, read, found, rejected = self._walk(
+                self._buffer,
+                position,
+                self._pending,
+                ends,
+                times,
+                read,
+                self._tables,
+                self._state,
+                room,
+                self._rejects,
             )
             if rejected:
                 rejects.append(self._rejects[:rejected].copy())
-            if is_done:
+            if read == len(ends):
                 break
             room = room[found:]
         self._pending = stop - position
@@ -121,7 +190,10 @@ class StreamDecoder:
         Decoded
             Rejects only.
         """
-        s, rejects = self._state[0], []
+        s = self._state[0]
+        parts = range(s["parts"])
+        rejects = [np.array([(s["part_offset"][k], s["part_length"][k], _TORN)], REJECT) for k in parts]
+        s["parts"] = 0
         if s["reject_offset"] >= 0:
             begin, reason = s["reject_offset"], s["reject_reason"]
             rejects.append(np.array([(begin, s["offset"] - begin, reason)], REJECT))
@@ -145,36 +217,43 @@ _DIFFERS, _MATCHES, _IS_CUT = range(3)
 def _scan(
     data: NDArray[np.uint8],
     p: int,
-    stop: int,
-    t_ns: int,
+    begin: int,
+    ends: NDArray[np.int64],
+    times: NDArray[np.int64],
+    read: int,
     tables: Tables,
     state: Records,
     frames: Records,
     rejects: Records,
-) -> tuple[int, int, int, bool]:
-    """Walk from `p` until the data or the room for rejects ends.
+) -> tuple[int, int, int, int]:
+    """Walk from `p`, read by read, until the reads or the room for rejects end.
+
+    Read k ends at `begin + ends[k]`; `read` is the first one that is not walked to its end. A message may
+    have to wait for bytes behind it that show what is before it, so a later read may complete it.
 
     Returns
     -------
     tuple
-        Position of the first byte that is neither in a frame nor rejected; number of frames and of rejects;
-        whether the data have ended. Bytes before that position then leave the buffer.
+        Position of the first byte that is neither in a frame nor rejected; first read that is not walked to
+        its end; number of frames and of rejects. After all reads, bytes before that position leave the
+        buffer.
     """
     # Out of the tuple once: each access inside the loop would count references.
-    kinds, fields, constants = tables
+    kinds, fields, multiplexed, constants, _ = tables
     kind, s = kinds[0], state[0]
     length, offset = kind["length"], s["offset"]
     found = rejected = 0
-    while rejected < rejects.shape[0]:
+    while read < ends.shape[0] and rejected < rejects.shape[0]:
+        stop = begin + ends[read]
         header = _compare(data, p, stop, constants)
         if header == _DIFFERS:
             _skip(s, offset + p, _NO_SYNC)
             p += 1
             continue
         if header == _IS_CUT or p + length > stop:
-            s["offset"] += p
-            return p, found, rejected, True
-        is_good = check_holds(data, p, kind)
+            read += 1
+            continue
+        is_good = plain_check_holds(data, p, kind)
         if s["reject_offset"] >= 0:
             _close_reject(rejects[rejected], s, offset + p)
             rejected += 1
@@ -183,18 +262,134 @@ def _scan(
             p += 1
             continue
         frame = frames[found]
-        fill(data, p, kind, fields, frame)
-        frame["offset"], frame["t_ns"] = offset + p, t_ns
+        fill(data, p, kind, fields, multiplexed, frame)
+        frame["offset"], frame["t_ns"] = offset + p, times[read]
         frame["damaged"] = (s["skipped"] + length - 1) // length
         s["skipped"] = 0
         found += 1
         p += length
-    return p, found, rejected, False
+    if read == ends.shape[0]:
+        s["offset"] += p
+    return p, read, found, rejected
+
+
+@kernel
+def _scan_kinds(
+    data: NDArray[np.uint8],
+    p: int,
+    begin: int,
+    ends: NDArray[np.int64],
+    times: NDArray[np.int64],
+    read: int,
+    tables: Tables,
+    state: Records,
+    frames: Records,
+    rejects: Records,
+) -> tuple[int, int, int, int]:
+    """Do what `_scan` does, for several kinds of message, multiplexed numbers or any checks; slower."""
+    kinds, fields, multiplexed, constants, checks = tables
+    s = state[0]
+    offset = s["offset"]
+    parts, length = _parts_of(kinds)
+    found = rejected = 0
+    while read < ends.shape[0] and rejected + MAX_MESSAGES < rejects.shape[0]:
+        stop = begin + ends[read]
+        k = _kind_at(data, p, stop, kinds, constants)
+        if k == _NO_KIND:
+            _skip(s, offset + p, _NO_SYNC)
+            p += 1
+            continue
+        if k == _CUT_KIND:
+            read += 1
+            continue
+        kind = kinds[k]
+        is_good = checks_hold(data, p, kind, checks)
+        if s["reject_offset"] >= 0:
+            _close_reject(rejects[rejected], s, offset + p)
+            rejected += 1
+        if not is_good:
+            _skip(s, offset + p, _CHECK_FAILED)
+            p += 1
+            continue
+        at = offset + p
+        p += kind["length"]
+        if kind["part"] < 0:
+            s["others"] += kind["length"]
+            if not kind["is_skipped"]:
+                fill(data, at - offset, kind, fields, multiplexed, s["latest"])
+            continue
+        if s["parts"] and (kind["part"] != s["parts"] or s["part_end"] != at):
+            rejected = _tear(s, rejects, rejected)
+        if kind["part"] != s["parts"]:
+            s["torn"] += 1
+            _reject(rejects[rejected], at, kind["length"], _TORN)
+            rejected += 1
+            continue
+        if s["parts"] == 0:
+            s["sample"] = s["latest"]
+        fill(data, at - offset, kind, fields, multiplexed, s["sample"])
+        s["part_offset"][s["parts"]], s["part_length"][s["parts"]] = at, kind["length"]
+        s["parts"] += 1
+        s["part_end"] = at + kind["length"]
+        if s["parts"] == parts:
+            frames[found] = s["sample"]
+            frame = frames[found]
+            frame["offset"], frame["t_ns"] = s["part_offset"][0], times[read]
+            frame["damaged"], frame["torn"] = (s["skipped"] + length - 1) // length, s["torn"]
+            hold(frame, s["latest"])
+            s["parts"] = s["skipped"] = s["torn"] = 0
+            found += 1
+    if read == ends.shape[0]:
+        s["offset"] += p
+    return p, read, found, rejected
+
+
+@kernel
+def _parts_of(kinds: Records) -> tuple[int, int]:
+    """Return how many messages make a sample, and their bytes."""
+    parts = length = 0
+    for k in range(kinds.shape[0]):
+        if kinds[k]["part"] >= 0:
+            parts += 1
+            length += kinds[k]["length"]
+    return parts, length
+
+
+_NO_KIND, _CUT_KIND = -1, -2
+
+
+@kernel
+def _kind_at(data: NDArray[np.uint8], p: int, stop: int, kinds: Records, constants: Records) -> int:
+    """Return the kind of message that is whole at `p`, or that none is, or that the data end too early."""
+    for k in range(kinds.shape[0]):
+        kind = kinds[k]
+        header = _compare(data, p, stop, constants[kind["first_constant"] : kind["end_constant"]])
+        if header == _MATCHES and p + kind["length"] <= stop:
+            return k
+        if header != _DIFFERS:
+            return _CUT_KIND
+    return _NO_KIND
+
+
+@kernel
+def _tear(s: np.void, rejects: Records, rejected: int) -> int:
+    """Reject the messages of the open sample; return the number of rejects."""
+    for k in range(s["parts"]):
+        _reject(rejects[rejected], s["part_offset"][k], s["part_length"][k], _TORN)
+        rejected += 1
+    s["torn"] += 1
+    s["parts"] = 0
+    return rejected
+
+
+@kernel
+def _reject(reject: np.void, offset: int, length: int, reason: int) -> None:
+    reject["offset"], reject["length"], reject["reason"] = offset, length, reason
 
 
 @kernel
 def _compare(data: NDArray[np.uint8], p: int, stop: int, constants: Records) -> int:
-    """Compare the bytes at `p` with the constant bytes of a frame, as far as they have come."""
+    """Compare the bytes at `p` with the constant bytes of a message, as far as they have come."""
     for c in range(constants.shape[0]):
         at = p + constants[c]["offset"]
         if at >= stop:
@@ -215,6 +410,5 @@ def _skip(s: np.void, offset: int, reason: int) -> None:
 @kernel
 def _close_reject(reject: np.void, s: np.void, end: int) -> None:
     """Add the open run of rejected bytes, which ends at this offset of the stream, to the rejects."""
-    reject["offset"], reject["length"] = s["reject_offset"], end - s["reject_offset"]
-    reject["reason"] = s["reject_reason"]
+    _reject(reject, s["reject_offset"], end - s["reject_offset"], s["reject_reason"])
     s["reject_offset"] = -1

@@ -117,7 +117,7 @@ def record(path: Path, counters: Iterable[int], profile: str = "imu50-rs422") ->
         pulses = np.zeros(len(counter[at : at + READ]), PULSES)
         increments = np.zeros(len(pulses), INCREMENTS)
         increments["counter"] = counter[at : at + READ]
-        pulses["counter"] = increments["counter"] % (1 << layout.counter_bits)
+        pulses["counter"] = increments["counter"] % (1 << layout.sequence.bits)
         pulses["temperature_degc"] = 35.0
         recorder.arrived(Arrival(at, encoder.encode(pulses).tobytes()))
         recorder.publish(Batch(pulses, increments, encode(increments, Source.SIMULATOR)))

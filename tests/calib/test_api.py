@@ -80,7 +80,7 @@ def result(folder: Path) -> IdentificationResult:
 def test_the_arms_are_identified_from_paths(result: IdentificationResult) -> None:
     # noise alone: the six differences are known to some 0.02 mm, five sigma at most
     assert np.abs(result.arms.r_b / MM - TRUE_MM).max() < 0.1
-    assert result.basis.name == "unit.yaml"
+    assert result.prior_calibration.name == "unit.yaml"
     assert [source.name for source in result.sources] == ["z_up.raw", "x_up.raw", "y_up.raw"]
 
 
@@ -89,13 +89,13 @@ def test_names_are_as_good_as_paths(here: Path, result: IdentificationResult) ->
         ["z_up.raw", "x_up.raw", "y_up.raw"], calibration="unit.yaml", site="site.yaml", profile=PROFILE
     )
     assert again.result.R_b.tobytes() == result.result.R_b.tobytes()
-    assert again.basis == result.basis
+    assert again.prior_calibration == result.prior_calibration
 
 
 def test_the_options_choose_the_method(here: Path, result: IdentificationResult) -> None:
     plain = calib.identify(
         ["z_up.raw", "x_up.raw", "y_up.raw"],
-        calibration=result.basis,
+        calibration=result.prior_calibration,
         site=result.site,
         profile=load(PROFILE),
         options=calib.EstimationOptions("plain"),
@@ -129,7 +129,7 @@ def test_a_capture_is_validated_with_its_lever_arms(here: Path) -> None:
     # identification needs no arms, compensation does; with the true ones hardly any velocity is left
     settings = {"calibration": "unit.yaml", "site": Path("site.yaml"), "profile": PROFILE}
     validation = calib.validate("z_up.raw", **settings, align_s=30.0)
-    assert validation.metrics.good
+    assert validation.good
     assert validation.trial.name == "z_up.raw"
     assert "z_up.raw: good; velocity after the motion" in repr(validation)
     write_calibration(here / "bare.yaml", NOMINAL.without_size_effect())
@@ -171,8 +171,8 @@ def test_results_are_short_in_a_notebook(result: IdentificationResult, site: Sit
 
 
 def test_html_is_escaped(result: IdentificationResult) -> None:
-    unit = result.basis.calibration.model_copy(update={"serial_number": "<b>&"})
-    hostile = replace(result, basis=result.basis._replace(calibration=unit))
+    unit = result.prior_calibration.calibration.model_copy(update={"serial_number": "<b>&"})
+    hostile = replace(result, prior_calibration=result.prior_calibration._replace(calibration=unit))
     assert "unit &lt;b&gt;&amp;," in hostile._repr_html_()
 
 

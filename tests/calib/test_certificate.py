@@ -35,11 +35,9 @@ SPREAD = CENTROID_BASIS * [1e-5, 1.1e-5, 1.2e-5, 1.8e-5, 1.9e-5, 2e-5]
 WHEN = datetime(2026, 11, 25, 12, 0, tzinfo=UTC)
 
 
-def findings(**changes: object) -> IdentificationResult:
+def identification(**changes: object) -> IdentificationResult:
     told = RunResult(
         label="z#1",
-        axis="+Z",
-        angle_deg=180.0,
         V_n=np.array([0.2, -0.1, 0.0]),
         H=np.zeros((3, 9)),
         compensated_n=np.zeros(3),
@@ -68,7 +66,7 @@ def findings(**changes: object) -> IdentificationResult:
     )
     return IdentificationResult(
         result=replace(result, **changes),  # type: ignore[arg-type]
-        basis=PriorCalibration(unit(), "unit.yaml", "ab" * 32),
+        prior_calibration=PriorCalibration(unit(), "unit.yaml", "ab" * 32),
         site=Site(latitude_deg=28.2, longitude_deg=113.0, height_m=60.0),
         limits=RotationLimits(),
         priors=Priors(),
@@ -87,8 +85,8 @@ def unit(serial_number: str = "50-0017") -> Calibration:
     return NOMINAL.model_copy(update={"serial_number": serial_number, "provenance": provenance})
 
 
-def test_a_certificate_comes_back_from_its_file_with_arms_covariance_and_gauge(tmp_path: Path) -> None:
-    found = findings()
+def test_a_certificate_read_from_its_file_has_the_same_arms_covariance_and_gauge(tmp_path: Path) -> None:
+    found = identification()
     path = tmp_path / "new.yaml"
     write(path, certificate(found, found.arms))
     read = read_calibration(path, "50-0017")
@@ -103,11 +101,11 @@ def test_a_certificate_comes_back_from_its_file_with_arms_covariance_and_gauge(t
     assert np.linalg.matrix_rank(back.covariance, tol=1e-13) == 6
 
 
-def test_the_certificate_keeps_the_static_calibration_and_says_how_the_arms_were_found() -> None:
-    found = findings()
+def test_the_certificate_keeps_the_static_calibration_and_has_the_provenance_of_the_arms() -> None:
+    found = identification()
     new = certificate(found, found.arms)
-    assert new.gyro == found.basis.calibration.gyro
-    assert new.accelerometer == found.basis.calibration.accelerometer
+    assert new.gyro == found.prior_calibration.calibration.gyro
+    assert new.accelerometer == found.prior_calibration.calibration.accelerometer
     assert new.provenance is not None
     assert new.provenance["static"] == "turntable, 2026-11-01"
     assert PROVENANCE_CONVERTED not in new.provenance  # of arms that are no more
@@ -125,13 +123,13 @@ def test_the_certificate_keeps_the_static_calibration_and_says_how_the_arms_were
 
 
 def test_nothing_is_certified_that_the_data_contradict() -> None:
-    found = findings(chi_square=250.0)
+    found = identification(chi_square=250.0)
     with pytest.raises(InputError, match=r"no certificate: .*expected chi-square of about 100, got 250"):
         certificate(found, found.arms)
 
 
 def test_nothing_is_certified_on_increments_that_carry_dither() -> None:
-    found = findings()
+    found = identification()
     shaken = replace(found.result.runs[0], H_rest=0.07)  # three arcsec of dither do this in ten seconds
     found = replace(found, result=replace(found.result, runs=(shaken,)))
     with pytest.raises(InputError, match=r"no certificate: the gyro increments carry dither.*0\.07 \(z#1\)"):
@@ -139,7 +137,7 @@ def test_nothing_is_certified_on_increments_that_carry_dither() -> None:
 
 
 def test_as_many_equations_as_unknowns_contradict_nothing() -> None:
-    found = findings(
+    found = identification(
         chi_square=0.0, degrees_of_freedom=0, method="plain", parameters=(), correlation=np.zeros((9, 0))
     )
     assert certificate(found, found.arms).size_effect is not None
@@ -149,7 +147,7 @@ def test_another_units_certificate_is_not_written_over(tmp_path: Path) -> None:
     path = tmp_path / "other.yaml"
     write_calibration(path, unit("50-0018"))
     before = path.read_bytes()
-    found = findings()
+    found = identification()
     with pytest.raises(InputError, match="got that of '50-0018'"):
         write(path, certificate(found, found.arms))
     assert path.read_bytes() == before
@@ -169,14 +167,14 @@ def test_the_units_own_certificate_is_kept_beside_the_new_one(tmp_path: Path) ->
     path = tmp_path / "unit.yaml"
     write_calibration(path, unit())
     before = path.read_bytes()
-    found = findings()
+    found = identification()
     write(path, certificate(found, found.arms))
     (kept,) = set(tmp_path.iterdir()) - {path}
     assert kept.read_bytes() == before
 
 
 def test_a_gauge_converted_to_and_fro_through_calibrations_is_the_same_to_a_nanometre() -> None:
-    found = findings()
+    found = identification()
     first = certificate(found, found.arms)
     for gauge in ("x", "z", "centroid"):
         first = with_lever_arms(
@@ -197,7 +195,7 @@ def test_a_calibration_without_arms_has_none_to_convert() -> None:
 
 
 def test_the_json_document_has_the_whole_result_with_units_in_its_names(tmp_path: Path) -> None:
-    found = findings(runs=())
+    found = identification(runs=())
     path = tmp_path / "r.json"
     write_json(path, result_document(found, convert(found.arms, "x")))
     document = json.loads(path.read_text())
@@ -209,5 +207,5 @@ def test_the_json_document_has_the_whole_result_with_units_in_its_names(tmp_path
     assert document["rank"] == 6
     assert np.shape(document["covariance_mm2"]) == (9, 9)
     assert np.shape(document["differences_covariance_mm2"]) == (6, 6)
-    assert np.shape(document["correlation_of_differences_with_nuisances"]) == (6, 1)
-    assert document["nuisances_si"][0]["name"] == "accelerometer_bias_x"
+    assert np.shape(document["correlation_of_differences_with_parameters"]) == (6, 1)
+    assert document["parameters_si"][0]["name"] == "accelerometer_bias_x"

@@ -25,15 +25,15 @@ from calib.bench.entries import (
     UnitDetected,
     to_json,
 )
-from calib.bench.evidence import Result
 from calib.bench.keys import Keyboard
 from calib.bench.queue_sink import QueueSink
+from calib.bench.result import Result
 from calib.bench.screen import OperatorScreen, plain
 from calib.bench.session import Session
 from calib.bench.technician import BENCH, Mistake, technician_scenario
 from calib.bench.verify import verify
+from calib.messages import english
 from calib.procedure.events import Accepted, Entered, Phase, Rejected, View
-from calib.procedure.messages import english
 from calib.procedure.plan import steps_left
 from calib.procedure.schema import Procedure
 from imudrv import profiles
@@ -42,7 +42,6 @@ from imudrv.diagnosis import LineState
 from imudrv.errors import InputError
 from imudrv.files import settings_file
 from imudrv.imu.compensation import Compensator
-from imudrv.imu.rate_filter import rate_filter
 from imudrv.imu.sequence import SequenceTracker
 from imudrv.recording.reader import Recording
 from imudrv.records import Arrival, Source
@@ -140,13 +139,9 @@ class Shown(OperatorScreen):
 
 def performed(scenario: Scenario) -> list[Batch]:
     """Samples of a scenario, in pieces of a fifth of a second."""
-    compensator = Compensator(
-        coefficients(NOMINAL.model_copy(update={"size_effect": None})),
-        LAYOUT,
-        rate_filter("causal", LAYOUT.interval_ns),
-    )
+    compensator = Compensator(coefficients(NOMINAL.model_copy(update={"size_effect": None})), LAYOUT)
     made = []
-    for chunk in simulate(scenario, LAYOUT.interval_ns):
+    for chunk in simulate(scenario, LAYOUT):
         for begin in range(0, len(chunk.pulses), 200):
             pulses = chunk.pulses[begin : begin + 200]
             increments = compensator.feed(pulses)
@@ -290,7 +285,17 @@ def test_messages_of_the_service_about_the_port_are_shown_and_journaled(
     assert "!" not in text.splitlines()[-1]
 
 
-def test_a_mistake_is_journaled_with_its_reasons_and_its_evidence_kept(session: Session) -> None:
+def test_nothing_is_accepted_while_the_rate_of_the_unit_is_not_that_of_its_profile(
+    session: Session, batches: list[Batch]
+) -> None:
+    wrong = LineState("wrong rate", "expected 1000 samples/s, the unit counts 500.0")
+    _, text = conducted(session, [*batches], port_states=[wrong] * 10 * len(batches))
+    assert "preflight: WRONG RATE: CHECK THE PROFILE | " in text
+    assert "! port wrong rate: expected 1000 samples/s, the unit counts 500.0" in text
+    assert not session.accepted
+
+
+def test_a_mistake_is_journaled_with_its_reasons_and_its_recording_is_kept(session: Session) -> None:
     scenario = technician_scenario(PROCEDURE, [Mistake("z-up", "short")], calibration=NOMINAL)
     _, text = conducted(session, performed(scenario))
     rejection = rejected(session)
@@ -357,7 +362,7 @@ def test_a_key_refers_to_the_view_that_the_operator_sees(
     assert phases(session, Phase.SETTLE) == []
 
 
-def test_evidence_is_complete_even_if_the_worker_is_late_by_a_whole_step(
+def test_recordings_are_complete_even_if_the_worker_is_late_by_a_whole_step(
     session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     done = technician_scenario(PROCEDURE, calibration=NOMINAL)

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import simpson
 
-from calib.dither.spectrum import Dither, compensated, gain, in_increments, of_case, size_effect
+from calib.dither.spectrum import Dither, compensated, gain, sensing_directions, size_effect
 from calib.dither.text import dither_text
 from imudrv import profiles
 from imudrv.calibration import Calibration
@@ -39,7 +39,7 @@ FILTERS = {name: rate_filter(name, TAU_NS) for name in NAMES}
 
 def dither(kind: tuple[list[float], list[float]], C_bg: Array = ALIGNED) -> Dither:
     amplitude, frequency = kind
-    return in_increments(C_bg, np.array(amplitude) * ARCSEC, frequency, PHASES)
+    return Dither(C_bg.T, np.array(amplitude) * ARCSEC, np.array(frequency), np.array(PHASES))
 
 
 def force_of(d: Dither, C_ba: Array, t: Array) -> Array:
@@ -169,7 +169,7 @@ def subtracted(d: Dither, C_ba: Array, C_bg: Array, name: str) -> tuple[Array, A
     pulses["elapsed_ns"] = TAU_NS * np.arange(1, n + 1)
     pulses["flags"] = Flag.VALID
     pulses["gyro"] = np.diff(np.rint(np.linalg.solve(C_bg, angle_b.T).T / fine), axis=0)
-    compensator = Compensator(c, profiles.load("imu50-rs422").layout(), FILTERS[name])
+    compensator = Compensator(c, profiles.load("imu50-rs422").layout(), name)
     got = compensator.feed(pulses)[25:]
     got = got[: round(PERIOD / TAU)]
     assert np.all(got["flags"] & Flag.SIZE_EFFECT)
@@ -190,7 +190,7 @@ def test_the_compensator_subtracts_what_the_formula_gives(kind, C_ba, C_bg, name
 
 def rectified_ug(name: str, arcsec: float, fraction: float = 1.0) -> float:
     """Mean that one gyro x puts on an accelerometer y with its arm of 30 mm along it."""
-    d = in_increments(ALIGNED, [fraction * arcsec * ARCSEC, 0.0, 0.0], [400.0] * 3)
+    d = dither(([fraction * arcsec, 0.0, 0.0], [400.0] * 3))
     arms = np.diag([30.0, 30.0, 30.0]) * MM
     return float(compensated(d, ALIGNED, arms, FILTERS[name], TAU).aliased(TAU).mean[1]) / UG
 
@@ -203,7 +203,7 @@ def test_raw_dither_through_causal_makes_milligs_and_the_case_reaction_less_than
         amplified = abs(gain(FILTERS["causal"], 400.0, TAU)) ** 2 / 3.0 + 2.0 / 3.0 * np.sinc(0.4) ** 2
         assert rectified_ug("causal", arcsec) == pytest.approx(-whole * amplified, rel=1e-9)
         assert abs(rectified_ug("causal", arcsec)) > 2000.0
-        case = in_increments(ALIGNED, [0.01 * arcsec * ARCSEC, 0.0, 0.0], [400.0] * 3)
+        case = dither(([0.01 * arcsec, 0.0, 0.0], [400.0] * 3))
         true = size_effect(case, ALIGNED, np.diag([30.0] * 3) * MM).mean[1] / UG
         assert abs(true) < 1.0
         assert abs(rectified_ug("dither", arcsec, 0.01)) < abs(true)
@@ -211,8 +211,7 @@ def test_raw_dither_through_causal_makes_milligs_and_the_case_reaction_less_than
 
 @pytest.mark.parametrize("frequency_hz", [370.0, 385.0, 400.0, 415.0, 430.0])
 def test_the_dither_filter_passes_less_than_a_microg_of_the_raw_dither(frequency_hz):
-    frequencies = [frequency_hz, 405.0, 395.0]
-    d = in_increments(ALIGNED, np.full(3, 180.0) * ARCSEC, frequencies, PHASES)
+    d = dither(([180.0] * 3, [frequency_hz, 405.0, 395.0]))
     arms = np.full((3, 3), 30.0) * MM
     lines = compensated(d, ALIGNED, arms, FILTERS["dither"], TAU).aliased(TAU)
     assert np.abs(lines.mean).max() < 1e-6 * UG  # residual of squares: 20 mg times the square of 4e-9
@@ -221,10 +220,10 @@ def test_the_dither_filter_passes_less_than_a_microg_of_the_raw_dither(frequency
     assert np.abs(got.mean(axis=0)).max() < 1e-2 * UG  # rounding of pulses of 1e-13 rad
 
 
-def test_the_case_turns_about_the_directions_in_which_the_gyros_sense():
-    d = of_case(MISALIGNED, [ARCSEC] * 3, [400.0] * 3)
-    np.testing.assert_allclose(np.linalg.norm(d.axes_b, axis=1), 1.0, rtol=1e-15)
-    along = np.linalg.inv(MISALIGNED) @ d.axes_b.T
+def test_the_gyros_sense_along_the_rows_of_the_inverse_of_C_bg():
+    axes_b = sensing_directions(MISALIGNED)
+    np.testing.assert_allclose(np.linalg.norm(axes_b, axis=1), 1.0, rtol=1e-15)
+    along = np.linalg.inv(MISALIGNED) @ axes_b.T
     np.testing.assert_allclose(np.diag(along), np.linalg.norm(np.linalg.inv(MISALIGNED), axis=1), rtol=1e-15)
 
 
@@ -241,7 +240,7 @@ def test_the_text_has_means_lines_aliases_and_what_each_filter_passes():
     text = dither_text(calibration, THREE[0], THREE[1], list(FILTERS.values()), TAU)
     words = [line.split() for line in text.splitlines()]
     (false_causal,) = (w for w in words if w[:1] == ["causal"])
-    d = in_increments(ALIGNED, np.array(THREE[0]) * ARCSEC, THREE[1])
+    d = Dither(ALIGNED, np.array(THREE[0]) * ARCSEC, np.array(THREE[1]))
     expected = -compensated(d, ALIGNED, R_B, FILTERS["causal"], TAU).mean / UG
     np.testing.assert_allclose([float(w) for w in false_causal[3:6]], expected, rtol=5e-3)  # three digits
     assert "800 Hz   200 Hz        0.234" in text

@@ -75,7 +75,7 @@ def test_repeats_begin_where_the_turn_before_has_ended() -> None:
     assert {(s.align_s, s.rest_s, s.turn_deg) for s in plan.steps} == {(60.0, 9.0, -180)}
 
 
-def test_all_faults_of_a_file_are_told_at_once(tmp_path: Path) -> None:
+def test_all_faults_of_a_file_are_reported_at_once(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text(
         "format: imu50-procedure\nversion: 1\nname: mine\nalign_s: 5\nlimits: {tilt: 3}\nposes:\n"

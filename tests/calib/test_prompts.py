@@ -11,12 +11,12 @@ from string import Formatter
 import pytest
 
 import calib
+from calib.messages import Message, catalogue, english, message, verbatim
 from calib.procedure.events import Rejected
-from calib.procedure.messages import Message, catalogue, english, message, verbatim
 
 LANGUAGES = [
     path.name.removesuffix(".yaml")
-    for path in resources.files("calib.procedure.messages").iterdir()
+    for path in resources.files("calib.messages").iterdir()
     if path.name.endswith(".yaml")
 ]
 HEADLINE = 38  # characters: what a screen of 80 columns has in letters of three rows
@@ -78,7 +78,7 @@ def test_headlines_are_readable_from_afar_with_the_longest_values() -> None:
             assert shown.isascii()
 
 
-def test_an_event_goes_into_a_journal_with_keys_and_numbers() -> None:
+def test_a_journaled_event_has_keys_and_numbers() -> None:
     reason = message("rest_interrupted", elapsed_s=1.5, rest_s=15.0, cause=message("unit_restarted"))
 
     entry = json.loads(json.dumps(asdict(Rejected("z", 1, (reason,), 5))))

@@ -39,7 +39,7 @@ unit:
 
 
 @pytest.fixture(scope="module")
-def findings(tmp_path_factory: pytest.TempPathFactory) -> IdentificationResult:
+def identification(tmp_path_factory: pytest.TempPathFactory) -> IdentificationResult:
     """Three poses, a hostile file name, a unit whose number is markup; a second, small turn in each."""
     folder = tmp_path_factory.mktemp("report")
     captures = []
@@ -55,13 +55,13 @@ def findings(tmp_path_factory: pytest.TempPathFactory) -> IdentificationResult:
 
 
 @pytest.fixture(scope="module")
-def arms(findings: IdentificationResult) -> tuple[LeverArms, LeverArms]:
-    return findings.arms, convert(findings.arms, "x")
+def arms(identification: IdentificationResult) -> tuple[LeverArms, LeverArms]:
+    return identification.arms, convert(identification.arms, "x")
 
 
 @pytest.fixture(scope="module")
-def page(findings: IdentificationResult, arms: tuple[LeverArms, LeverArms]) -> str:
-    return report_html(findings, arms)
+def page(identification: IdentificationResult, arms: tuple[LeverArms, LeverArms]) -> str:
+    return report_html(identification, arms)
 
 
 class Tags(HTMLParser):
@@ -98,7 +98,7 @@ def test_the_page_loads_nothing_and_runs_nothing(page: str) -> None:
     assert len(page) < 1_500_000
 
 
-def test_its_figures_are_whole_drawings_that_load_nothing_either(page: str) -> None:
+def test_its_figures_are_complete_and_load_nothing_from_elsewhere(page: str) -> None:
     images = re.findall(r'src="data:image/svg\+xml;base64,([^"]+)"', page)
     assert len(images) == 1 + 3 + 1 + 1  # points, a run each, before and after, directions
     for image in images:
@@ -108,43 +108,43 @@ def test_its_figures_are_whole_drawings_that_load_nothing_either(page: str) -> N
         assert not re.search(r'(?:href|src)="(?!#)', drawing)
 
 
-def test_what_comes_from_files_is_escaped(
-    page: str, findings: IdentificationResult, arms: tuple[LeverArms, LeverArms]
+def test_text_from_files_is_escaped(
+    page: str, identification: IdentificationResult, arms: tuple[LeverArms, LeverArms]
 ) -> None:
     assert "<img src=x" not in page
     assert "&lt;img src=x onerror=alert(1)&gt;&amp;" in page
     assert "50&lt;b&gt;&amp;17" in page
     assert "\x1b" not in page
-    assert "\x1b" not in as_text(document(findings, arms))
+    assert "\x1b" not in as_text(document(identification, arms))
 
 
 def test_the_text_fits_80_columns_whatever_the_names(
-    findings: IdentificationResult, arms: tuple[LeverArms, LeverArms]
+    identification: IdentificationResult, arms: tuple[LeverArms, LeverArms]
 ) -> None:
-    text = as_text(document(findings, arms))
+    text = as_text(document(identification, arms))
     assert max(map(cell_len, text.splitlines())) <= 80
     assert not re.search(r"[ \t]$", text, re.MULTILINE)
     assert 60 * "z" in re.sub(r"\s", "", text)  # folded, not cut
 
 
 def test_a_report_is_a_function_of_the_findings(
-    page: str, findings: IdentificationResult, arms: tuple[LeverArms, LeverArms]
+    page: str, identification: IdentificationResult, arms: tuple[LeverArms, LeverArms]
 ) -> None:
-    assert report_html(findings, arms) == page
+    assert report_html(identification, arms) == page
 
 
 def test_text_and_page_show_the_same_numbers(
-    page: str, findings: IdentificationResult, arms: tuple[LeverArms, LeverArms]
+    page: str, identification: IdentificationResult, arms: tuple[LeverArms, LeverArms]
 ) -> None:
     numbers = re.compile(r"[+-]\d+\.\d+")
     body = re.sub(r'src="[^"]*"|<style>.*</style>', "", page, flags=re.DOTALL)
-    assert set(numbers.findall(as_text(document(findings, arms)))) == set(numbers.findall(body))
+    assert set(numbers.findall(as_text(document(identification, arms)))) == set(numbers.findall(body))
 
 
 def test_lever_arms_are_always_shown_with_their_gauge(
-    findings: IdentificationResult, arms: tuple[LeverArms, LeverArms]
+    identification: IdentificationResult, arms: tuple[LeverArms, LeverArms]
 ) -> None:
-    text = as_text(document(findings, arms))
+    text = as_text(document(identification, arms))
     heads = [line for line in text.splitlines() if line.startswith("  Sensing points in body axes")]
     assert heads == [f"  Sensing points in body axes, mm, gauge {gauge}" for gauge in ("centroid", "x")]
     assert len(re.findall(r"^  r_x  ", text, re.MULTILINE)) == 2
@@ -153,36 +153,38 @@ def test_lever_arms_are_always_shown_with_their_gauge(
 
 
 def test_every_rotation_has_a_verdict_or_a_reason_for_rejection(
-    findings: IdentificationResult, arms: tuple[LeverArms, LeverArms]
+    identification: IdentificationResult, arms: tuple[LeverArms, LeverArms]
 ) -> None:
-    text = " ".join(as_text(document(findings, arms)).split())
+    text = " ".join(as_text(document(identification, arms)).split())
     assert text.count("accepted: within all limits") == 3
     assert text.count("turned 30.0 deg, want 180 +- 5") == 3
 
 
-def test_the_verdict_is_bad_where_the_data_contradict_the_model(findings: IdentificationResult) -> None:
-    n = findings.result.degrees_of_freedom
+def test_the_verdict_is_bad_where_the_data_contradict_the_model(identification: IdentificationResult) -> None:
+    n = identification.result.degrees_of_freedom
     marks = {}
     for ratio in (0.5, 1.0, 1.5, 3.0):
-        result = replace(findings.result, chi_square=ratio * n)
-        marks[ratio] = list(verdict(replace(findings, result=result)))[1]
+        result = replace(identification.result, chi_square=ratio * n)
+        marks[ratio] = list(verdict(replace(identification, result=result)))[1]
     assert [marks[ratio][0] for ratio in marks] == ["note", "good", "caution", "bad"]
     assert "by a factor of 1.22" in marks[1.5][1]
     assert "No certificate is made" in marks[3.0][1]
 
 
-def test_dither_in_the_increments_is_a_bad_verdict_with_the_remedy(findings: IdentificationResult) -> None:
-    runs = findings.result.runs
-    shaken = replace(findings.result, runs=(replace(runs[0], H_rest=0.07), *runs[1:]))
-    bad = [text for mark, text in verdict(replace(findings, result=shaken)) if mark == "bad"]
+def test_dither_in_the_increments_is_a_bad_verdict_with_the_remedy(
+    identification: IdentificationResult,
+) -> None:
+    runs = identification.result.runs
+    shaken = replace(identification.result, runs=(replace(runs[0], H_rest=0.07), *runs[1:]))
+    bad = [text for mark, text in verdict(replace(identification, result=shaken)) if mark == "bad"]
     assert len(bad) == 1
     assert bad[0].startswith("The gyro increments carry dither or vibration: expected H of at most 0.002")
     assert "got 0.07 (" in bad[0]
     assert "let the unit remove its dither" in bad[0]
 
 
-def test_three_rotations_give_no_false_caution(findings: IdentificationResult) -> None:
-    marks = list(verdict(findings))
+def test_three_rotations_give_no_false_caution(identification: IdentificationResult) -> None:
+    marks = list(verdict(identification))
     assert {mark for mark, _ in marks} == {"good", "note"}
     notes = " ".join(text for mark, text in marks if mark == "note")
     assert "determined but not checked: no rotation is redundant" in notes
@@ -190,17 +192,17 @@ def test_three_rotations_give_no_false_caution(findings: IdentificationResult) -
     assert "agree with the model" not in " ".join(text for _, text in marks)
 
 
-def test_the_change_without_a_redundant_rotation_is_reported(findings: IdentificationResult) -> None:
+def test_the_change_without_a_redundant_rotation_is_reported(identification: IdentificationResult) -> None:
     shift = np.zeros((3, 3))
     shift[1, 2] = -0.02 * MM
     result = replace(
-        findings.result, leave_one_out=(LeaveOneOut("z#1", 6, shift), LeaveOneOut("x#1", 4, None))
+        identification.result, leave_one_out=(LeaveOneOut("z#1", 6, shift), LeaveOneOut("x#1", 4, None))
     )
-    notes = [text for mark, text in verdict(replace(findings, result=result)) if mark == "note"]
+    notes = [text for mark, text in verdict(replace(identification, result=result)) if mark == "note"]
     assert notes[0] == "Omitting one rotation changes no component by more than 0.020 mm (z#1)."
 
 
-def test_digits_follow_the_uncertainty(findings: IdentificationResult) -> None:
+def test_digits_follow_the_uncertainty(identification: IdentificationResult) -> None:
     r_b = np.full((3, 3), 1.23456789 * MM)
     coarse = arms_text(LeverArms(r_b, np.diag(np.full(9, (0.25 * MM) ** 2)), "given"))
     fine = arms_text(LeverArms(r_b, np.diag(np.full(9, (0.0123 * MM) ** 2)), "given"))

@@ -4,23 +4,22 @@ import os
 import pty
 import sys
 import termios
-import time
 from collections.abc import Iterator
 from io import StringIO
 from threading import Event
 from typing import Any
 
 import pytest
+from realtime import DEADLINE_S, until
 from rich.console import Console
 
 from calib.bench import block_letters
 from calib.bench.keys import Keyboard
 from calib.bench.screen import NO_DATA, NO_FRAMES, OperatorScreen, plain, screen, with_port_state
+from calib.messages import english, verbatim
 from calib.procedure.events import Abort, Confirm, Phase, Redo, Skip, View
-from calib.procedure.messages import english, verbatim
 from imudrv.diagnosis import LineState
 
-DEADLINE_S = 20.0
 LONG = (
     "gravity reads 9.203 m/s^2 where 9.792 +- 0.02 is expected: check the accelerometers' scale factors",
     "the readings are those of a unit whose accelerometers X and Y are exchanged, or of another pose",
@@ -43,8 +42,6 @@ HEADLINES = (
 
 def view(phase: Phase = Phase.PLACE, headline: str = "TURN IT: X UP", **changes: Any) -> View:
     values: dict[str, Any] = {
-        "step": 2,
-        "steps": 3,
         "step_id": "x-up",
         "title": "step 2 of 3: X up, +180 deg",
         "hints": (),
@@ -142,7 +139,7 @@ def test_bars_figures_and_reasons_are_on_the_screen() -> None:
     assert bar.count("█") == bar.count("░")
 
 
-def test_a_question_takes_the_place_of_the_keys() -> None:
+def test_a_question_replaces_the_keys() -> None:
     assert rows(view(), question="once more: abort")[-1] == "once more: abort"
 
 
@@ -155,7 +152,10 @@ def test_a_question_takes_the_place_of_the_keys() -> None:
             "NO DATA: CHECK THE CABLE | ! port silent: nothing for 0.4 s",
         ),
         (LineState("unreadable", "no frame"), "NO FRAMES: CHECK THE PROFILE | ! port unreadable: no frame"),
-        (LineState("streaming", "expected 1000 samples/s"), "TURN IT: X UP | ! expected 1000 samples/s"),
+        (
+            LineState("wrong rate", "expected 1000 samples/s"),
+            "WRONG RATE: CHECK THE PROFILE | ! port wrong rate: expected 1000 samples/s",
+        ),
         (LineState("streaming"), "TURN IT: X UP"),
     ],
 )
@@ -209,10 +209,7 @@ def test_the_bell_rings_when_bells_grow(monkeypatch: pytest.MonkeyPatch) -> None
 
 def written(shown: OperatorScreen) -> None:
     """Wait until a screen has written everything."""
-    end = time.monotonic() + DEADLINE_S
-    while not shown.is_idle:
-        assert time.monotonic() < end
-        time.sleep(0.001)
+    until(lambda: shown.is_idle)
 
 
 class Stopped(StringIO):
@@ -229,7 +226,7 @@ class Stopped(StringIO):
         return super().write(text)
 
 
-def test_nobody_waits_for_a_stopped_terminal_and_then_only_the_newest_view_is_drawn(
+def test_a_stopped_terminal_blocks_no_caller_and_then_draws_only_the_newest_view(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("TERM", "xterm-256color")
@@ -269,7 +266,7 @@ def test_what_is_printed_and_plain_lines_wait_in_order_for_a_stopped_reader() ->
     ]
 
 
-def test_a_terminal_that_is_gone_is_an_error_at_the_next_view() -> None:
+def test_a_closed_terminal_is_an_error_at_the_next_view() -> None:
     class Gone(StringIO):
         def write(self, text: str) -> int:
             raise OSError("gone")
@@ -326,7 +323,7 @@ def test_a_key_that_makes_no_sense_now_does_nothing(terminal: Terminal) -> None:
         assert keys.action(view(actions=("skip",))) is None
 
 
-def test_q_aborts_only_when_it_comes_twice_in_a_row(terminal: Terminal) -> None:
+def test_q_aborts_only_when_it_is_pressed_twice_in_a_row(terminal: Terminal) -> None:
     with Keyboard() as keys:
         terminal.type(b"q")
         assert keys.action(view()) is None

@@ -1,6 +1,7 @@
 """Folder of a session: nothing in it can be lost, doubled or changed undetected."""
 
 import json
+import os
 from collections.abc import Callable, Iterator
 from hashlib import sha256
 from io import StringIO
@@ -25,8 +26,8 @@ from calib.bench.resume import check_files, require_same, require_temperature, r
 from calib.bench.session import Session
 from calib.bench.state import INITIAL_CERTIFICATE, JOURNAL
 from calib.bench.verify import verify
+from calib.messages import Message, english
 from calib.procedure.events import Entered, Finished, Phase, Redone
-from calib.procedure.messages import Message, english
 from imudrv.calibration import Calibration, read_calibration_file, write_calibration
 from imudrv.errors import InputError
 from imudrv.files import atomic, settings_file
@@ -89,7 +90,7 @@ def accepted_step(step_id: str, recording: str, degc: dict[str, float], **more: 
 
 @pytest.fixture
 def accept(recorded: Callable[..., Path]) -> Accept:
-    """Accept an attempt with its files; the recording begins at `since`, the evidence at 1000."""
+    """Accept an attempt with its files; the recording begins at `since`, the attempt at 1000."""
 
     def accept(
         session: Session, step_id: str, degc: dict[str, float] = DEGC, since: int = 900, **more: object
@@ -132,6 +133,15 @@ def line_of(data: bytes, at: int) -> int:
 # Hash chain
 
 
+def test_a_new_journal_and_its_name_are_on_the_disk(
+    session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synchronised = []
+    monkeypatch.setattr(os, "fsync", lambda fd: synchronised.append(Path(f"/proc/self/fd/{fd}").resolve()))
+    journals.begin(tmp_path / JOURNAL, session.plan)
+    assert synchronised == [tmp_path / JOURNAL, tmp_path]
+
+
 def test_each_line_is_json_with_the_hash_of_its_text_and_of_the_line_before(folder: Path) -> None:
     before = ""
     for line in (folder / JOURNAL).read_text().splitlines():
@@ -141,7 +151,7 @@ def test_each_line_is_json_with_the_hash_of_its_text_and_of_the_line_before(fold
         assert sha256(line[: line.rindex(', "sha256": ')].encode()).hexdigest() == before
 
 
-def test_the_first_line_holds_the_plan(folder: Path) -> None:
+def test_the_first_line_is_the_plan(folder: Path) -> None:
     plan = json.loads((folder / JOURNAL).read_text().splitlines()[0])
     certificate = folder.parent / "unit.yaml"
     assert plan["unit"] == "nominal"
@@ -311,7 +321,7 @@ def test_a_journal_cut_in_its_last_line_is_repaired_and_nothing_before_it_change
         again.close()
 
 
-def test_a_second_power_cut_while_the_first_is_repaired_does_no_harm(folder: Path) -> None:
+def test_a_second_power_cut_during_the_repair_of_the_first_is_repaired(folder: Path) -> None:
     journal = folder / JOURNAL
     torn = journal.read_bytes()[:-30]
     journal.write_bytes(torn)
@@ -371,7 +381,7 @@ def test_a_step_is_accepted_until_it_is_done_again(session: Session, accept: Acc
     assert session.accepted["z-up"].recording == "run-z-up-2.mcap"
 
 
-def test_a_recording_that_does_not_cover_its_step_is_named_whether_there_is_a_certificate_or_not(
+def test_a_recording_that_does_not_cover_its_step_is_named_with_and_without_a_certificate(
     session: Session, accept: Accept
 ) -> None:
     accept(session, "z-up")
@@ -539,7 +549,7 @@ def test_a_session_with_a_damaged_recording_is_not_resumed(session: Session, acc
 
 
 @pytest.mark.parametrize("answer", ["y", "n"])
-def test_the_operator_is_asked_before_a_session_is_resumed(
+def test_a_session_is_resumed_only_after_the_operator_confirms(
     session: Session, accept: Accept, monkeypatch: pytest.MonkeyPatch, answer: str
 ) -> None:
     accept(session, "z-up")

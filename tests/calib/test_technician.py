@@ -12,12 +12,12 @@ from calib.bench.technician import Mistake, technician_scenario
 from calib.estimation.joint import estimate_joint
 from calib.estimation.result import TO_DIFFERENCES, LeverArmEstimate
 from calib.estimation.runs import NavigationOptions, navigate_rotations
+from calib.messages import english
 from calib.procedure.engine import Engine
 from calib.procedure.events import Accepted, Event, Finished, Phase, Rejected, Restarted
-from calib.procedure.messages import english
 from calib.procedure.plan import load, predicted
 from calib.procedure.schema import Procedure
-from imudrv import Coefficients, Compensator, coefficients, load_profile, rate_filter
+from imudrv import Coefficients, Compensator, coefficients, load_profile
 from imudrv.errors import InputError
 from imudrv.records import Flag, Records
 from imudrv.sim.scenario import Scenario
@@ -58,16 +58,16 @@ class Performance:
             accepted = self.engine.accepted[step.id]
             counter = self.samples["counter"]
             inside = (counter >= accepted.first_counter) & (counter <= accepted.last_counter)
-            evidence = navigate_rotations(
+            navigated = navigate_rotations(
                 lambda inside=inside: [self.samples[inside]],
-                calibration.accelerometer.C_ba_array,
+                np.array(calibration.accelerometer.C_ba),
                 self.scenario.site,
                 step.id,
                 NavigationOptions(self.procedure.rotation_limits(step), expected=step.up[1]),
             )
-            assert len(evidence.runs) == 1
-            assert not evidence.rejected
-            runs += evidence.runs
+            assert len(navigated.runs) == 1
+            assert not navigated.rejected
+            runs += navigated.runs
         return estimate_joint(runs)
 
 
@@ -76,8 +76,8 @@ def samples_of(scenario: Scenario) -> Records:
     calibration = scenario.unit.calibration
     assert calibration is not None
     plain: Coefficients = coefficients(calibration.model_copy(update={"size_effect": None}))
-    compensator = Compensator(plain, LAYOUT, rate_filter("centred", LAYOUT.interval_ns))
-    samples = np.concatenate([compensator.feed(c.pulses) for c in simulate(scenario, LAYOUT.interval_ns)])
+    compensator = Compensator(plain, LAYOUT, "centred")
+    samples = np.concatenate([compensator.feed(c.pulses) for c in simulate(scenario, LAYOUT)])
     for unplug in scenario.faults.unplugs:
         out = (samples["t_ns"] > unplug.at_s * 1e9) & (
             samples["t_ns"] <= (unplug.at_s + unplug.duration_s) * 1e9

@@ -86,7 +86,7 @@ def engines(request: pytest.FixtureRequest) -> dict[Phase, Engine]:
 
 @pytest.mark.parametrize("outcome", list(ACTIONS))
 @pytest.mark.parametrize("phase", list(Phase))
-def test_the_engine_answers_every_action_in_every_phase_as_the_table_says(
+def test_the_engine_follows_the_table_for_every_action_in_every_phase(
     phase: Phase, outcome: Outcome, engines: dict[Phase, Engine]
 ) -> None:
     expected = TRANSITIONS.get((phase, outcome), phase)
@@ -135,7 +135,7 @@ def test_every_phase_offers_the_keys_that_have_an_effect_and_no_others(
     assert offered == effective
 
 
-def test_evidence_that_could_not_be_stored_is_asked_again_in_every_phase_after_the_acceptance(
+def test_a_step_without_a_complete_recording_is_repeated_in_every_phase_after_its_acceptance(
     engines: dict[Phase, Engine],
 ) -> None:
     for phase in (Phase.VERDICT, Phase.DONE):

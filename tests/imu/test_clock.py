@@ -12,9 +12,8 @@ from imudrv.imu.clock import SLEW, STALL_EDGES_S, ClockModel
 from imudrv.imu.coefficients import Coefficients
 from imudrv.imu.compensation import Compensator
 from imudrv.imu.envelope import MAX_SKEW
-from imudrv.imu.rate_filter import rate_filter
 from imudrv.profiles import load
-from imudrv.records import INCREMENTS, PULSES, Flag, Records
+from imudrv.records import INCREMENTS, PULSES, Flag, Records, Timebase
 
 TAU = 1_000_000
 BEGIN = 1_700_000_000_000_000_000
@@ -142,7 +141,7 @@ def test_a_skew_that_no_clock_has_is_not_locked() -> None:
     assert sum(clock.report.stalls) == 0
 
 
-def test_the_time_on_the_wire_is_taken_off() -> None:
+def test_the_time_on_the_wire_is_subtracted() -> None:
     pulses = samples(15_000)
     pulses["arrival_ns"] = truth(pulses, 0.0) + 477_000
     clock = ClockModel(TAU, transmission_ns=477_000)
@@ -157,12 +156,34 @@ def test_before_the_lock_stamps_follow_the_least_delay() -> None:
     pulses["arrival_ns"] = np.maximum(true, BEGIN + 101 * MS)  # a backlog of 100 ms when the port was opened
     stamps, locked = stamped(ClockModel(TAU), pulses)
     assert not locked.any()
-    # What is ahead waits at half speed: 100 ms while the backlog shrinks, as long again afterwards.
-    np.testing.assert_array_equal(stamps[201:], true[201:])
-    assert np.diff(stamps).min() == TAU // 2
+    # What is ahead advances by a hundredth of an interval: 1 ms while the backlog shrinks, gone 2 ms later.
+    np.testing.assert_array_equal(stamps[103:], true[103:])
+    assert np.diff(stamps).min() == TAU // 100
 
 
-def test_a_better_line_is_gone_over_to_slowly() -> None:
+@pytest.mark.parametrize("old", [1, 100, 4_000, 60_000])
+@pytest.mark.parametrize("gap_s", [0, 60, 3600])
+def test_after_old_samples_from_a_buffer_the_stamps_are_soon_right(old: int, gap_s: int) -> None:
+    pulses = samples(old + 15_000)
+    pulses["counter"][old:] += 1000 * gap_s
+    pulses["elapsed_ns"][old:] += gap_s * S
+    pulses["arrival_ns"] = truth(pulses, 20.0)
+    pulses["arrival_ns"][:old] = pulses["arrival_ns"][old]  # a serial server sends all that it kept at once
+    stamps, locked = stamped(ClockModel(TAU), pulses)
+    ahead = stamps - pulses["arrival_ns"]
+    # The old ones cannot be right, but each must be later than the one before: by a hundredth of an interval.
+    must = TAU // 100 * np.arange(len(pulses))
+    assert (ahead[: old + 1] <= must[: old + 1]).all()
+    assert np.diff(stamps).min() > 0
+    # The host catches up 0.99 ms a sample. Until there is a line, 20 ppm are missed, 0.2 ms of 10 s.
+    assert np.abs(ahead[old + old // 98 + 2 :]).max() < 0.21 * MS
+    # Only what came after the buffer shows the clock: locked after 10 s of that, and the bin it began in.
+    assert not locked[: old + LOCK - 250].any()
+    assert locked[old + LOCK + 250 :].all()
+    assert np.abs(ahead[-1000:]).max() < 2_000  # as with pure jitter
+
+
+def test_a_better_fit_is_approached_slowly() -> None:
     pulses = samples(40_000)
     true = truth(pulses, 0.0)
     arrival = true + 2 * MS
@@ -176,15 +197,15 @@ def test_a_better_line_is_gone_over_to_slowly() -> None:
 
 
 @pytest.mark.parametrize("step_s", [0.006, 1.0, 3600.0])
-def test_a_host_clock_that_steps_back_begins_the_line_anew(step_s: float) -> None:
+def test_a_host_clock_that_steps_back_restarts_the_fit(step_s: float) -> None:
     pulses = samples(60_000)
     pulses["arrival_ns"] = truth(pulses, 0.0)
     pulses["arrival_ns"][30_000:] -= round(step_s * S)
     stamps, locked = stamped(ClockModel(TAU), pulses)
     assert locked[29_999]
     assert not locked[30_000:40_000].any()
-    assert np.diff(stamps).min() == TAU // 2
-    # Half speed takes as long again as the step; an hour is not over here.
+    assert np.diff(stamps).min() == TAU // 100
+    # The stamps wait for as long as the step; an hour is not over here.
     assert locked[40_001:].all() == (step_s < 30.0)
     if step_s < 30.0:
         np.testing.assert_array_equal(stamps[40_001:], pulses["arrival_ns"][40_001:])
@@ -211,7 +232,28 @@ def test_a_host_clock_that_steps_forward_is_followed_after_ten_seconds() -> None
     assert locked[50_250:].all()
 
 
-def test_a_restart_of_the_unit_begins_the_line_anew() -> None:
+@pytest.mark.parametrize(
+    ("slew", "seconds", "worst_ms"),
+    [
+        (0.083, 12, 872),  # a host that becomes fast looks like a stall, until all samples of 10 s were late
+        (-0.083, 12, 6),  # one that becomes slow is noticed when arrivals are 5 ms early
+        (500e-6, 200, 25),  # 20 ms late are allowed, in the worst bin of 10 s
+    ],
+)
+def test_stamps_are_right_within_ten_seconds_after_ntp_has_slewed_the_host(
+    slew: float, seconds: int, worst_ms: int
+) -> None:
+    begin, end = 60_000, 60_000 + 1000 * seconds
+    true = truth(samples(end + 40_000), 20.0)
+    true += np.rint(slew * TAU * np.clip(np.arange(len(true)) - begin, 0, end - begin)).astype(np.int64)
+    stamps, locked = stamped(ClockModel(TAU), heard(true, np.random.default_rng(9)))
+    assert np.abs(stamps - true)[LOCK:].max() < worst_ms * MS
+    assert np.abs(stamps - true)[end + LOCK :].max() < 0.25 * MS  # 20 ppm of 10 s without a line
+    assert locked[end + 2 * LOCK :].all()
+    assert np.abs(stamps - true)[end + 2 * LOCK + 1000 :].max() < 0.05 * MS
+
+
+def test_a_restart_of_the_unit_restarts_the_fit() -> None:
     before, after = samples(20_000, first=500_000), samples(20_000)
     after["elapsed_ns"] += before["elapsed_ns"][-1]  # as the tracker counts on
     before["arrival_ns"] = BEGIN + TAU * np.arange(20_000)
@@ -223,7 +265,7 @@ def test_a_restart_of_the_unit_begins_the_line_anew() -> None:
     assert locked[20_000 + LOCK :].all()
 
 
-def test_a_counter_that_went_around_unseen_begins_the_line_anew() -> None:
+def test_a_jump_of_the_counter_without_elapsed_time_restarts_the_fit() -> None:
     pulses = samples(20_000)
     pulses["arrival_ns"] = truth(pulses, 0.0)
     pulses["counter"][15_000:] += 7  # without elapsed time
@@ -232,7 +274,7 @@ def test_a_counter_that_went_around_unseen_begins_the_line_anew() -> None:
     assert not locked[15_000:].any()
 
 
-def test_a_sample_that_comes_twice_begins_the_line_anew_and_stamps_still_increase() -> None:
+def test_a_repeated_sample_restarts_the_fit_and_stamps_still_increase() -> None:
     pulses = samples(12_000)
     pulses["arrival_ns"] = truth(pulses, 0.0)
     stamps, locked = stamped(ClockModel(TAU), np.insert(pulses, 11_000, pulses[11_000]))
@@ -241,7 +283,7 @@ def test_a_sample_that_comes_twice_begins_the_line_anew_and_stamps_still_increas
     assert np.diff(stamps).min() > 0
 
 
-def test_a_host_clock_that_slept_through_a_gap_begins_the_line_anew() -> None:
+def test_a_host_clock_that_was_suspended_during_a_gap_restarts_the_fit() -> None:
     pulses = samples(60_000)
     pulses["arrival_ns"] = truth(pulses, 0.0)
     pulses = np.concatenate([pulses[:20_000], pulses[40_000:]])
@@ -249,10 +291,9 @@ def test_a_host_clock_that_slept_through_a_gap_begins_the_line_anew() -> None:
     stamps, locked = stamped(ClockModel(TAU), pulses)
     assert locked[LOCK:20_000].all()
     assert not locked[20_000:30_000].any()
-    # The gap counts as 20 s for the stamps, of which 10 s are waited off, 5 s are left for 10 s.
-    assert np.diff(stamps).min() == TAU // 2
+    # The gap is longer than what the stamps would be ahead after it, so none of them is.
     assert locked[30_001:].all()
-    np.testing.assert_array_equal(stamps[30_001:], pulses["arrival_ns"][30_001:])
+    np.testing.assert_array_equal(stamps, pulses["arrival_ns"])
 
 
 def test_a_gap_that_the_counter_knows_keeps_the_lock() -> None:
@@ -264,7 +305,7 @@ def test_a_gap_that_the_counter_knows_keeps_the_lock() -> None:
     assert np.abs(stamps - pulses["arrival_ns"])[LOCK:].max() <= 1
 
 
-def test_a_gap_longer_than_the_window_begins_the_line_anew() -> None:
+def test_a_gap_longer_than_the_window_restarts_the_fit() -> None:
     pulses = samples(140_000)
     pulses["arrival_ns"] = truth(pulses, 50.0)
     pulses = np.concatenate([pulses[:20_000], pulses[120_000:]])
@@ -388,6 +429,58 @@ def test_ten_hours_need_no_more_memory_than_a_minute_and_stay_locked() -> None:
     assert clock.report.skew_ppm == pytest.approx(12.0, abs=0.03)
 
 
+def on_the_arrivals_scale(count: int, seed: int) -> Records:
+    return heard(truth(samples(count), 20.0), np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize("offset_ns", [3600 * S, -3600 * S, 12 * MS])
+def test_stamps_step_with_the_host_s_clock_at_once_and_the_lock_is_kept(offset_ns: int) -> None:
+    pulses = on_the_arrivals_scale(40_000, 5)
+    steady, _ = stamped(ClockModel(TAU), pulses)
+    clock = ClockModel(TAU)
+    before = clock.feed(pulses[:25_000]).copy()
+    clock.follow(Timebase(offset_ns))
+    after = clock.feed(pulses[25_000:])
+    np.testing.assert_array_equal(before["t_ns"], steady[:25_000])
+    np.testing.assert_array_equal(after["t_ns"], steady[25_000:] + offset_ns)
+    assert after["locked"].all()
+    assert np.flatnonzero(after["stepped"]).tolist() == [0]
+    assert not before["stepped"].any()
+    assert clock.report.steps == 1
+
+
+def test_a_timebase_from_before_the_first_sample_is_no_step() -> None:
+    pulses = on_the_arrivals_scale(100, 7)
+    steady, _ = stamped(ClockModel(TAU), pulses)
+    clock = ClockModel(TAU)
+    clock.follow(Timebase(5 * S, 3 * S))
+    stamps = clock.feed(pulses)
+    np.testing.assert_array_equal(stamps["t_ns"], steady + 5 * S)
+    assert not stamps["stepped"].any()
+    assert clock.report.steps == 0
+
+
+@pytest.mark.parametrize("error_ns", [-400 * MS, -3 * MS, 0, 15 * MS, 400 * MS])
+def test_after_a_suspend_a_new_line_begins_whatever_the_hardware_clock_was_wrong_by(error_ns: int) -> None:
+    pulses = on_the_arrivals_scale(60_000, 8)
+    pulses = np.concatenate([pulses[:20_000], pulses[32_000:]])  # the unit ran on for 12 s
+    pulses["arrival_ns"][20_000:] += error_ns
+    clock = ClockModel(TAU)
+    before = clock.feed(pulses[:20_000])
+    clock.follow(Timebase(0, 12 * S + error_ns))
+    stamps = np.concatenate([before, clock.feed(pulses[20_000:])])
+    assert np.flatnonzero(stamps["stepped"]).tolist() == [20_000]
+    assert stamps["locked"][LOCK:20_000].all()
+    assert not stamps["locked"][20_000:30_000].any()
+    # The new line is level at first: 20 ppm of 10 s, and delays of 0.1 ms that a quarter of a second levels.
+    late = pulses["arrival_ns"] - stamps["t_ns"]
+    assert np.abs(late[20_250:30_000] - late[19_000:20_000].mean()).max() < 5 * MS
+    error = stamps["t_ns"] - error_ns - truth(samples(60_000), 20.0)[32_000 - 20_000 :]
+    assert np.abs(error[20_250:30_000]).max() < 0.25 * MS
+    assert stamps["locked"][30_000:].all()
+    assert np.abs(error[31_500:]).max() < 2_000  # after slewing 0.2 ms at 200 ppm: 1 s
+
+
 COEFFICIENTS = Coefficients(
     gyro_scale=np.full(3, 1e-6),
     gyro_bias=np.zeros(3),
@@ -401,7 +494,7 @@ COEFFICIENTS = Coefficients(
 
 @given(cuts=st.lists(st.integers(0, 11_000), max_size=20))
 @settings(deadline=None, max_examples=25)
-def test_increments_that_come_later_get_the_stamps_of_their_samples(cuts: list[int]) -> None:
+def test_delayed_increments_get_the_stamps_of_their_samples(cuts: list[int]) -> None:
     layout = load("imu50-rs422").layout()
     true = truth(samples(11_000), 20.0)
     pulses = heard(true, np.random.default_rng(3))
@@ -409,7 +502,7 @@ def test_increments_that_come_later_get_the_stamps_of_their_samples(cuts: list[i
     pulses["flags"][5_000] = Flag.MISSING_BEFORE
     stamps, locked = stamped(ClockModel(TAU), pulses)
     clock = ClockModel(TAU)
-    compensator = Compensator(COEFFICIENTS, layout, rate_filter("dither", TAU))
+    compensator = Compensator(COEFFICIENTS, layout, "dither")
     edges = [0, *sorted(min(c, len(pulses)) for c in cuts), len(pulses)]
     out = []
     for a, b in pairwise(edges):
@@ -429,6 +522,18 @@ def test_samples_that_never_came_out_are_passed_over() -> None:
     increments = np.zeros(2, INCREMENTS)
     increments["t_ns"] = pulses["elapsed_ns"][[40, 99]]
     assert clock.stamp(increments)["t_ns"].tolist() == stamps[[40, 99]].tolist()
+
+
+def test_the_flag_of_a_step_moves_to_the_next_sample_that_comes_out() -> None:
+    pulses = on_the_arrivals_scale(100, 4)
+    clock = ClockModel(TAU)
+    clock.feed(pulses[:50])
+    clock.follow(Timebase(S))
+    clock.feed(pulses[50:])
+    increments = np.zeros(3, INCREMENTS)
+    increments["t_ns"] = pulses["elapsed_ns"][[40, 60, 61]]
+    stamped = clock.stamp(increments)
+    assert (stamped["flags"] & Flag.CLOCK_STEPPED != 0).tolist() == [False, True, False]
 
 
 def test_an_increment_that_no_sample_belongs_to_is_refused() -> None:

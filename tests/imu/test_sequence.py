@@ -11,12 +11,18 @@ from hypothesis import strategies as st
 from imudrv.imu.conversion import MAX_INTERVAL_NS
 from imudrv.imu.sequence import WINDOW, SampleCounts, SequenceTracker
 from imudrv.profiles import load
-from imudrv.records import FRAME, NO_TEMPERATURE, Flag, Records
-from imudrv.wire.layout import Layout
+from imudrv.records import FRAME, Flag, Records
+from imudrv.wire.layout import Layout, SequenceKind
+from imudrv.wire.layout import Sequence as Numbering
 
 INCREMENTS = load("imu50-rs422").layout()
 TOTALS = load("imu50-rs422-acc").layout()
 TAU = 1_000_000
+
+
+def with_counter(bits: int, layout: Layout = INCREMENTS) -> Layout:
+    """A layout with another counter."""
+    return replace(layout, sequence=Numbering(SequenceKind.COUNTER, bits))
 
 
 def frames(counters: Sequence[int], **columns: object) -> Records:
@@ -47,7 +53,7 @@ def totals(increments: list[list[int]]) -> np.ndarray:
     return np.cumsum(increments, axis=0) % 2**16
 
 
-def test_an_unbroken_run_is_handed_on_whole():
+def test_an_unbroken_run_is_passed_on_complete():
     pulses, counts = run([5, 6, 7], gyro=[[1, 2, 3]] * 3, accelerometer=[[4, 5, 6]] * 3)
     assert anomalies(counts) == {}
     assert (counts.frames, counts.good, counts.expected, counts.lost) == (3, 3, 3, 0)
@@ -62,7 +68,7 @@ def test_an_unbroken_run_is_handed_on_whole():
 
 @pytest.mark.parametrize("bits", [8, 16, 32])
 def test_the_counter_goes_across_its_wrap(bits):
-    layout = replace(INCREMENTS, counter_bits=bits)
+    layout = with_counter(bits)
     top = 2**bits
     pulses, counts = run([top - 2, top - 1, 0, 1], layout)
     assert anomalies(counts) == {}
@@ -71,20 +77,20 @@ def test_the_counter_goes_across_its_wrap(bits):
 
 @pytest.mark.parametrize("bits", [8, 16, 32])
 def test_losses_across_the_wrap_are_counted(bits):
-    layout = replace(INCREMENTS, counter_bits=bits)
+    layout = with_counter(bits)
     pulses, counts = run([2**bits - 1, 5], layout)
     assert anomalies(counts) == {"missing": 5}
     assert pulses["elapsed_ns"].tolist() == [TAU, 7 * TAU]
 
 
 def test_a_counter_of_8_bits_goes_around_many_times():
-    layout = replace(INCREMENTS, counter_bits=8)
+    layout = with_counter(8)
     pulses, counts = run([i % 256 for i in range(1000)], layout)
     assert anomalies(counts) == {}
     assert pulses["counter"].tolist() == list(range(1000))
 
 
-def test_what_did_not_come_is_missing_and_the_next_sample_says_so():
+def test_lost_samples_are_counted_and_the_next_one_is_flagged():
     pulses, counts = run([1, 2, 6, 7])
     assert anomalies(counts) == {"missing": 3}
     assert (counts.expected, counts.good, counts.lost) == (7, 4, 3)
@@ -102,19 +108,19 @@ def test_rejected_bytes_and_torn_pairs_explain_losses_but_never_more_than_there_
     assert anomalies(counts) == {}
 
 
-def test_a_frame_that_comes_after_a_later_one_is_out_of_order_and_no_longer_missing():
+def test_a_frame_after_a_later_one_is_out_of_order_and_no_longer_missing():
     pulses, counts = run([1, 2, 5, 4, 6])
     assert anomalies(counts) == {"out_of_order": 1, "missing": 1}
     assert pulses["counter"].tolist() == [1, 2, 5, 6]
 
 
-def test_a_frame_that_comes_twice_is_a_duplicate():
+def test_a_repeated_frame_is_a_duplicate():
     pulses, counts = run([1, 2, 2, 1, 3, 2])
     assert anomalies(counts) == {"duplicate": 3}
     assert pulses["counter"].tolist() == [1, 2, 3]
 
 
-def test_a_frame_out_of_order_that_comes_twice_is_counted_so_once():
+def test_a_repeated_frame_out_of_order_is_counted_out_of_order_once():
     _, counts = run([1, 5, 3, 3])
     assert anomalies(counts) == {"out_of_order": 1, "duplicate": 1, "missing": 2}
 
@@ -155,7 +161,7 @@ def test_two_frames_that_jump_and_do_not_agree_both_have_an_invalid_counter():
     assert anomalies(counts) == {"invalid_counter": 2, "damaged": 2}
 
 
-def test_a_jump_is_believed_once_the_next_frame_agrees():
+def test_a_jump_is_accepted_once_the_next_frame_agrees():
     tracker = SequenceTracker(INCREMENTS)
     assert len(tracker.feed(frames([10, 10 + WINDOW + 1]))) == 1
     assert tracker.counts.invalid_counter == 1
@@ -164,7 +170,7 @@ def test_a_jump_is_believed_once_the_next_frame_agrees():
     assert anomalies(tracker.counts) == {"missing": WINDOW + 1}
 
 
-def test_after_a_restart_time_goes_on_and_the_break_is_flagged():
+def test_after_a_restart_time_continues_and_the_break_is_flagged():
     pulses, counts = run([1000, 1001, 0, 1])
     assert anomalies(counts) == {"restarts": 1}
     assert counts.expected == 4
@@ -217,7 +223,7 @@ def test_totals_need_a_new_reference_after_a_restart_and_the_break_is_flagged_ev
     assert pulses["flags"][1] == Flag.VALID | Flag.LONG_INTERVAL | Flag.MISSING_BEFORE
 
 
-def test_a_gap_so_long_that_the_totals_may_have_gone_round_is_not_valid():
+def test_a_gap_in_which_the_totals_may_have_wrapped_is_not_valid():
     # 10 000 pulses a millisecond before a gap of four: the difference of 16 bits is not sure any more.
     sent = totals([[0] * 3, [10_000] * 3, [40_000] * 3])
     pulses, _ = run([0, 1, 5], TOTALS, gyro=sent)
@@ -248,9 +254,9 @@ def test_a_count_at_the_end_of_its_width_is_saturated(sensor, pulse, saturated):
     assert pulses[sensor].tolist() == [[0, pulse, 0]]
 
 
-def test_temperatures_become_degrees_and_unheard_ones_are_not_known():
-    counts = np.zeros((1, 6), np.int32)
-    counts[0, :4] = [3512, NO_TEMPERATURE, -5, 0]
+def test_temperatures_are_in_degrees_and_unreceived_ones_are_unknown():
+    counts = np.full((1, 6), np.nan)
+    counts[0, :4] = [3512, np.nan, -5, 0]
     pulses, _ = run([1], temperature=counts)
     expected = [35.12, np.nan, -0.05, 0.0, np.nan, np.nan]
     assert np.array_equal(pulses["temperature_degc"][0], expected, equal_nan=True)
@@ -263,7 +269,7 @@ ARRIVALS = st.lists(st.tuples(STEPS, st.integers(0, 4), st.integers(0, 3)), min_
 
 @given(st.integers(0, 2**32 - 1), ARRIVALS, st.sampled_from([8, 16, 32]), st.booleans(), st.integers(0, 60))
 def test_the_counts_add_up_for_any_counters_and_any_batches(first, arrivals, bits, running, cut):
-    layout = replace(TOTALS if running else INCREMENTS, counter_bits=bits)
+    layout = with_counter(bits, TOTALS if running else INCREMENTS)
     steps, damaged, torn = np.array(arrivals).T
     gyro = np.random.default_rng(first).integers(0, 100, (len(steps), 3))
     rows = frames((first + np.cumsum(steps)) % 2**bits, damaged=damaged, torn=torn, gyro=gyro)

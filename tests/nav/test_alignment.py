@@ -156,7 +156,7 @@ def test_a_level_unit_whose_pulses_hardly_change_is_not_predicted_too_well() -> 
     assert np.mean(np.square(z)) < chi2.ppf(0.995, 12) / 12
 
 
-def test_sigma_shrinks_while_it_goes_on() -> None:
+def test_sigma_decreases_with_time() -> None:
     increments, _ = standing(np.eye(3), seed=1)
     alignment = Alignment(LATITUDE, GYRO_BIAS, ACCELEROMETER_BIAS)
     sigmas = []
@@ -167,7 +167,7 @@ def test_sigma_shrinks_while_it_goes_on() -> None:
     assert alignment.done
 
 
-def test_pieces_give_the_same_bits_and_the_rest_comes_back() -> None:
+def test_pieces_give_the_same_bits_and_the_remainder_is_returned() -> None:
     increments, _ = standing(rotation((1, 2, 3), 1.0), 70.0, seed=2)
     whole, pieces = (Alignment(LATITUDE, GYRO_BIAS, ACCELEROMETER_BIAS, 60.0) for _ in range(2))
     rest = whole.feed(increments)
@@ -177,7 +177,7 @@ def test_pieces_give_the_same_bits_and_the_rest_comes_back() -> None:
     assert pieces.result().q_nb.tobytes() == whole.result().q_nb.tobytes()
 
 
-def test_swinging_that_comes_back_does_not_spoil_heading() -> None:
+def test_swinging_about_a_fixed_attitude_does_not_disturb_heading() -> None:
     # 0.5 mrad at 0.4 Hz: mean rates over the window would be off by up to 0.5 mrad / 60 s = 8e-6 rad/s of
     # 6e-5
     swung, at_end = standing(np.eye(3), 121.9, swing_rad=0.5e-3)
@@ -217,7 +217,7 @@ def test_a_moved_platform_is_caught_with_time_and_size(what: str) -> None:
         ((0.5, 0.0, 0.0, 10.0), "expected a length of 30 to 7200 s, got 10 s"),
     ],
 )
-def test_settings_that_make_no_sense_are_refused(arguments: tuple[float, ...], message: str) -> None:
+def test_invalid_settings_are_refused(arguments: tuple[float, ...], message: str) -> None:
     with pytest.raises(InputError, match=message):
         Alignment(*arguments)
 

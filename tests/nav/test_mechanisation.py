@@ -15,7 +15,7 @@ from size_effect import size_effect_increment
 from imudrv.errors import InputError
 from imudrv.nav.attitude import conjugate, product, quaternion_of_matrix, quaternion_of_vector, rotation, turn
 from imudrv.nav.earth import EARTH_RATE, ECCENTRICITY_SQUARED, SEMI_MAJOR_AXIS, earth_rate_n, normal_gravity
-from imudrv.nav.mechanisation import MEASUREMENT, NAVIGATION, Navigator, body_step
+from imudrv.nav.mechanisation import MEASUREMENT, NAVIGATION, Navigator, Place, body_step
 from imudrv.records import INCREMENTS, Records
 from imudrv.site import Site
 from imudrv.units import MM, NS, UG, URAD
@@ -23,7 +23,7 @@ from imudrv.units import MM, NS, UG, URAD
 Array = NDArray[np.float64]
 
 LATITUDE, LONGITUDE, HEIGHT = radians(28.2), radians(113.0), 60.0
-SITE = (LATITUDE, LONGITUDE, HEIGHT, None)
+SITE = Place(LATITUDE, LONGITUDE, HEIGHT)
 GRAVITY = normal_gravity(LATITUDE, HEIGHT)
 OMEGA_IE = np.array(earth_rate_n(LATITUDE))
 TAU_NS = 1_000_000
@@ -91,7 +91,7 @@ def turning(
 
 def navigated(run: Run, C_nb: Array | None = None, **options: Any) -> Records:
     q_nb = quaternion_of_matrix(run.C_nb if C_nb is None else C_nb)
-    return Navigator(*SITE, q_nb, **options).feed(run.increments)
+    return Navigator(SITE, q_nb, **options).feed(run.increments)
 
 
 def at_rest(n: int, C_nb: Array, tau_ns: int) -> Records:
@@ -106,7 +106,7 @@ def at_rest(n: int, C_nb: Array, tau_ns: int) -> Records:
 
 @pytest.mark.parametrize("C_nb", [Z_UP, rotation((1.0, 2.0, 3.0), 0.7)])
 def test_an_hour_at_rest_stays_at_rest(C_nb: Array) -> None:
-    rows = Navigator(*SITE, quaternion_of_matrix(C_nb), every=1000).feed(at_rest(360_000, C_nb, 10_000_000))
+    rows = Navigator(SITE, quaternion_of_matrix(C_nb), every=1000).feed(at_rest(360_000, C_nb, 10_000_000))
     # Left out is g zeta^2, at 10 ms up to 5e-12 m/s^2. The vertical channel is unstable: an hour makes of it
     # sinh(k t) / k = 1.5e5 s times as much velocity, and cosh(k t) / k^2 = 9e7 s^2 times height, k^2 = 2 g /
     # R.
@@ -118,7 +118,7 @@ def test_an_hour_at_rest_stays_at_rest(C_nb: Array) -> None:
 
 def test_an_error_of_velocity_swings_with_schulers_period() -> None:
     tau_ns = 100_000_000
-    rows = Navigator(*SITE, (1.0, 0.0, 0.0, 0.0), (0.0, 0.1, 0.0), every=10).feed(
+    rows = Navigator(SITE, (1.0, 0.0, 0.0, 0.0), (0.0, 0.1, 0.0), every=10).feed(
         at_rest(60_000, Z_UP, tau_ns)
     )
     speed = rows["v_n"][:, 1]
@@ -201,7 +201,7 @@ def test_a_flight_along_a_great_circle_and_back_closes(north_m: float, east_m: f
         0.5 * tau * wk * force_n(ends[:-1] + 0.5 * tau * (1.0 + xk)) for xk, wk in zip(x, w, strict=True)
     )
     run = records(dtheta, C_nb.inv().apply(dv), tau_ns)
-    rows = Navigator(*SITE, quaternion_of_matrix(C_nb.as_matrix())).feed(run)
+    rows = Navigator(SITE, quaternion_of_matrix(C_nb.as_matrix())).feed(run)
 
     apart = place_e(rows["latitude_rad"], rows["longitude_rad"], rows["height_m"]) - place_e(*way(ends[1:]))
     # The Earth's rate is that of an interval's beginning, so T / 2 = 25 ms late: at 250 m/s 7e-11 rad/s,
@@ -215,10 +215,10 @@ def test_a_flight_along_a_great_circle_and_back_closes(north_m: float, east_m: f
 def test_measured_gravity_is_an_offset_that_keeps_the_fall_with_height() -> None:
     measured = GRAVITY + 5e-4
     up = records(np.tile(OMEGA_IE * 1e-3, (1000, 1)), np.tile([0.0, 0.0, measured * 1e-3], (1000, 1)))
-    still = Navigator(LATITUDE, LONGITUDE, HEIGHT, measured, (1, 0, 0, 0)).feed(up)
+    still = Navigator(SITE._replace(gravity_m_s2=measured), (1, 0, 0, 0)).feed(up)
     np.testing.assert_allclose(still["v_n"], 0.0, atol=1e-10)  # rounding
     for speed in (100.0, 1.0):
-        high = Navigator(LATITUDE, LONGITUDE, HEIGHT, measured, (1, 0, 0, 0), (0.0, 0.0, speed)).feed(up)
+        high = Navigator(SITE._replace(gravity_m_s2=measured), (1, 0, 0, 0), (0.0, 0.0, speed)).feed(up)
         # rising for a second, gravity falls by 3.086e-6 / s^2 times the height: 1.5e-4 m/s in all at 100 m/s;
         # computed a centimetre after the other it lags by half a centimetre, of 0.5 m on the average
         expected = 3.086e-6 * speed / 2.0
@@ -287,8 +287,8 @@ def test_intervals_may_differ() -> None:
     for name in ("interval_ns", "dtheta_b", "dv_b"):
         long[name] = np.add.reduceat(run[name], cuts, axis=0)
     long["t_ns"] = np.cumsum(long["interval_ns"])
-    rows = Navigator(*SITE, quaternion_of_matrix(X_UP), C_ba=C_BA).feed(long)
-    fine = Navigator(*SITE, quaternion_of_matrix(X_UP), C_ba=C_BA).feed(run)
+    rows = Navigator(SITE, quaternion_of_matrix(X_UP), C_ba=C_BA).feed(long)
+    fine = Navigator(SITE, quaternion_of_matrix(X_UP), C_ba=C_BA).feed(run)
     # 4 ms at 2.4 rad/s turn 0.01 rad; third order in it, 1e-6 g / 24, for a second
     np.testing.assert_allclose(rows["v_n"][-1], fine["v_n"][-1], atol=2e-6)
     # the rule for rates leaves 16 ms^3 of the third derivative, the mid attitude (0.01 rad)^2 / 24 of 7 m/s a
@@ -317,9 +317,9 @@ def test_any_chunks_give_the_same_bits(cuts: list[int], every: int, matrices: bo
     increments = noisy(400)
     options: dict[str, Any] = {"every": every, "C_ba": C_BA if matrices else None}
     q = np.array([0.5, 0.5, 0.5, 0.5])
-    whole = Navigator(*SITE, q, **options)
+    whole = Navigator(SITE, q, **options)
     expected = whole.feed(increments)
-    parts = Navigator(*SITE, q, **options)
+    parts = Navigator(SITE, q, **options)
     got = np.concatenate([parts.feed(chunk) for chunk in np.split(increments, sorted(cuts))])
     assert got.tobytes() == expected.tobytes()
     assert parts.latest.tobytes() == whole.latest.tobytes()
@@ -330,7 +330,7 @@ def test_any_chunks_give_the_same_bits(cuts: list[int], every: int, matrices: bo
 
 def test_one_by_one_is_the_batch() -> None:
     increments = noisy(200)
-    one, batch = (Navigator(*SITE, (1, 0, 0, 0), C_ba=C_BA) for _ in range(2))
+    one, batch = (Navigator(SITE, (1, 0, 0, 0), C_ba=C_BA) for _ in range(2))
     live = np.concatenate([one.feed(increments[k : k + 1]) for k in range(200)])
     assert live.tobytes() == batch.feed(increments).tobytes()
 
@@ -338,10 +338,10 @@ def test_one_by_one_is_the_batch() -> None:
 def test_the_interpreter_gives_the_same_bits() -> None:
     program = (
         "import sys, numpy as np\n"
-        "from imudrv.nav.mechanisation import Navigator\n"
+        "from imudrv.nav.mechanisation import Navigator, Place\n"
         "from imudrv.records import INCREMENTS\n"
         "rows = np.frombuffer(sys.stdin.buffer.read(), INCREMENTS)\n"
-        "out = Navigator(0.5, 1.9, 60.0, None, (1, 0, 0, 0), C_ba=np.eye(3) + 1e-3).feed(rows)\n"
+        "out = Navigator(Place(0.5, 1.9, 60.0), (1, 0, 0, 0), C_ba=np.eye(3) + 1e-3).feed(rows)\n"
         "sys.stdout.buffer.write(out.tobytes())\n"
     )
     increments = noisy(60)
@@ -352,27 +352,27 @@ def test_the_interpreter_gives_the_same_bits() -> None:
         env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
         check=True,
     )
-    compiled = Navigator(0.5, 1.9, 60.0, None, (1, 0, 0, 0), C_ba=np.eye(3) + 1e-3).feed(increments)
+    compiled = Navigator(Place(0.5, 1.9, 60.0), (1, 0, 0, 0), C_ba=np.eye(3) + 1e-3).feed(increments)
     assert plain.stdout == compiled.tobytes()
 
 
 def test_rows_bear_the_samples_they_belong_to() -> None:
     increments = noisy(10)
-    rows = Navigator(*SITE, (1, 0, 0, 0), every=4).feed(increments)
+    rows = Navigator(SITE, (1, 0, 0, 0), every=4).feed(increments)
     assert rows.dtype == NAVIGATION
     assert rows["counter"].tolist() == [3, 7]
     assert rows["t_ns"].tolist() == increments["t_ns"][[3, 7]].tolist()
     assert rows["flags"].tolist() == increments["flags"][[3, 7]].tolist()
-    assert Navigator(*SITE, (1, 0, 0, 0), C_ba=C_BA).feed(increments).dtype == MEASUREMENT
+    assert Navigator(SITE, (1, 0, 0, 0), C_ba=C_BA).feed(increments).dtype == MEASUREMENT
 
 
 @pytest.mark.parametrize("gravity", [None, 9.795])
 def test_navigation_from_a_site_starts_at_rest_at_its_place(gravity: float | None) -> None:
-    place = Site(latitude_deg=28.2, longitude_deg=113.0, height_m=60.0, gravity_m_s2=gravity)
+    site = Site(latitude_deg=28.2, longitude_deg=113.0, height_m=60.0, gravity_m_s2=gravity)
     q = np.array([0.5, 0.5, 0.5, 0.5])
     options: dict[str, Any] = {"C_ba": C_BA, "every": 7}
-    by_site = Navigator.from_site(place, q, **options)
-    by_hand = Navigator(place.latitude_rad, place.longitude_rad, 60.0, gravity, q, **options)
+    by_site = Navigator(site.place, q, **options)
+    by_hand = Navigator(Place(site.latitude_rad, site.longitude_rad, 60.0, gravity), q, **options)
     assert not by_site.latest["v_n"].any()
     assert by_site.feed(noisy(50)).tobytes() == by_hand.feed(noisy(50)).tobytes()
 
@@ -383,14 +383,14 @@ def test_navigation_from_a_site_starts_at_rest_at_its_place(gravity: float | Non
         (SITE, (1.0, 0.0, 0.0), {}, r"expected attitude q_nb as finite numbers of shape \(4,\)"),
         (SITE, (2.0, 0.0, 0.0, 0.0), {}, "expected q_nb of length 1 within 1e-6, got 2; normalise it"),
         (SITE, (np.nan, 0.0, 0.0, 0.0), {}, "finite"),
-        ((1.55, 0.0, 0.0, None), (1, 0, 0, 0), {}, "expected a latitude of at most 1.5 rad, got 1.55"),
+        (Place(1.55, 0.0, 0.0), (1, 0, 0, 0), {}, "expected a latitude of at most 1.5 rad, got 1.55"),
         (SITE, (1, 0, 0, 0), {"every": 0}, "expected a row every 1 or more samples, got 0"),
         (SITE, (1, 0, 0, 0), {"C_ba": np.eye(2)}, "expected C_ba"),
     ],
 )
-def test_a_start_that_makes_no_sense_is_refused(site: Any, q: Any, options: Any, message: str) -> None:
+def test_an_invalid_start_is_refused(site: Any, q: Any, options: Any, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        Navigator(*site, q, **options)
+        Navigator(site, q, **options)
 
 
 # --- the measurement matrices ---

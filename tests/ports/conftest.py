@@ -2,12 +2,11 @@ import time
 from collections.abc import Callable, Iterator
 
 import pytest
+from realtime import DEADLINE_S
 
 from imudrv import load_profile
 from imudrv.ports import Arrival, Port, PortEndedError, open_port
 from imudrv.profiles.schema import Profile
-
-PATIENCE_S = 20.0
 
 
 @pytest.fixture(scope="session")
@@ -44,7 +43,7 @@ def arrivals() -> Callable[[Port, int], list[Arrival]]:
     """Reads until so many bytes or messages have come; fails if they do not."""
 
     def collect(port: Port, count: int) -> list[Arrival]:
-        deadline = time.monotonic() + PATIENCE_S
+        deadline = time.monotonic() + DEADLINE_S
         found: list[Arrival] = []
         while sum(len(arrival.data) for arrival in found) < count:
             assert time.monotonic() < deadline

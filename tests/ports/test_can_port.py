@@ -1,21 +1,24 @@
 import os
+import select
 import socket
 import subprocess
 import sys
 import threading
 import time
 import tty
+from contextlib import suppress
 
 import can
 import numpy as np
 import pytest
+from realtime import DEADLINE_S, free_port
 
-from imudrv import Source
+from imudrv import Source, load_profile
 from imudrv.errors import InputError
 from imudrv.hostclock import now_ns
 from imudrv.ports import PortLostError, open_port
 from imudrv.ports.can import CanPort
-from imudrv.records import MESSAGE
+from imudrv.records import EXTENDED, MESSAGE
 
 GROUP = "239.74.163.2"
 
@@ -28,7 +31,7 @@ def _message(identifier=0x150, data=b"\x01\x02\x03", **more):
     return can.Message(arbitration_id=identifier, data=data, is_extended_id=identifier > 0x7FF, **more)
 
 
-def test_messages_come_as_records_stamped_when_they_came(can_profile, opened, arrivals):
+def test_messages_are_records_stamped_on_arrival(can_profile, opened, arrivals):
     port = opened("can://virtual/stamped", can_profile)
     assert port.source is Source.HARDWARE
     before = now_ns()
@@ -50,13 +53,13 @@ def test_messages_come_as_records_stamped_when_they_came(can_profile, opened, ar
     assert all(arrival.data.flags.writeable for arrival in found)
 
 
-def test_a_wait_in_vain_brings_no_messages(can_profile, opened):
+def test_a_timeout_returns_no_messages(can_profile, opened):
     nothing = opened("can://virtual/silent", can_profile).read(0.01).data
     assert nothing.dtype == MESSAGE
     assert nothing.size == 0
 
 
-def test_a_long_can_fd_message_comes_whole(canfd, opened, arrivals):
+def test_a_long_can_fd_message_is_received_complete(canfd, opened, arrivals):
     port = opened("can://virtual/fd", canfd)
     with _bus("fd", protocol=can.CanProtocol.CAN_FD) as unit:
         unit.send(_message(0x158, bytes(range(48)), is_fd=True, bitrate_switch=True))
@@ -65,7 +68,7 @@ def test_a_long_can_fd_message_comes_whole(canfd, opened, arrivals):
     assert bytes(message["data"]) == bytes(range(48)) + bytes(16)
 
 
-def test_only_data_of_the_units_own_identifiers_come(can_profile, opened, arrivals):
+def test_only_data_of_the_units_own_identifiers_are_received(can_profile, opened, arrivals):
     port = opened("can://virtual/busy", can_profile)
     with _bus("busy") as unit:
         for identifier in (0x7, 0x14F, 0x150, 0x18000150, 0x154):
@@ -75,12 +78,37 @@ def test_only_data_of_the_units_own_identifiers_come(can_profile, opened, arriva
     assert [int(id) for arrival in arrivals(port, 2) for id in arrival.data["id"]] == [0x150, 0x153]
 
 
-def test_an_identifier_of_29_bits_is_received(can_profile, opened, arrivals):
+def test_an_identifier_of_29_bits_is_received_and_differs_from_one_of_11_bits(can_profile, opened, arrivals):
     messages = (can_profile.messages[0].model_copy(update={"id": 0x1ABCDEF0}), *can_profile.messages[1:])
     port = opened("can://virtual/extended", can_profile.model_copy(update={"messages": messages}))
     with _bus("extended") as unit:
+        unit.send(can.Message(arbitration_id=0x151, is_extended_id=True))
         unit.send(_message(0x1ABCDEF0))
-    assert arrivals(port, 1)[0].data["id"].tolist() == [0x1ABCDEF0]
+        unit.send(_message(0x151))
+    received = np.concatenate([arrival.data for arrival in arrivals(port, 2)])
+    assert received["id"].tolist() == [EXTENDED | 0x1ABCDEF0, 0x151]
+
+
+def test_of_a_parameter_group_every_priority_and_source_comes(opened, arrivals):
+    port = opened("can://virtual/groups", load_profile("openimu-j1939"))
+    sent = [0x0CF02A80, 0x18F02D81, 0x0CF02B80, 0x0CF02D80]
+    with _bus("groups") as unit:
+        for identifier in sent:
+            unit.send(_message(identifier))
+    received = np.concatenate([arrival.data for arrival in arrivals(port, 3)])
+    assert received["id"].tolist() == [
+        EXTENDED | identifier for identifier in sent if identifier != 0x0CF02B80
+    ]
+
+
+def test_a_bus_that_filters_nothing_gives_both_kinds_of_identifier(arrivals):
+    with _bus("unfiltered") as unit:
+        port = CanPort("can://virtual/unfiltered", _bus("unfiltered"))
+        unit.send(can.Message(arbitration_id=0x150, is_extended_id=True))
+        unit.send(_message(0x150))
+        received = np.concatenate([arrival.data for arrival in arrivals(port, 2)])
+        port.close()
+    assert received["id"].tolist() == [EXTENDED | 0x150, 0x150]
 
 
 class Broken(can.BusABC):
@@ -129,7 +157,7 @@ def test_a_bus_that_goes_away_is_a_lost_port(bus, message):
 
 
 @pytest.mark.parametrize("nonsense", [ValueError("no number"), IndexError("dlc"), OTHER_ERROR])
-def test_nonsense_or_a_passing_error_is_no_message_and_no_loss(nonsense):
+def test_an_invalid_message_or_a_transient_error_is_no_message_and_no_loss(nonsense):
     port = CanPort("can://broken/0", Broken(nonsense))
     assert port.read(0).data.size == 0
     port.close()
@@ -143,7 +171,7 @@ def test_a_closed_port_is_closed_once_and_lost_when_read(can_profile, opened):
         port.read(0)
 
 
-def test_a_can_interface_that_is_not_there_is_a_lost_port(can_profile):
+def test_an_absent_can_interface_is_a_lost_port(can_profile):
     with pytest.raises(PortLostError, match=r"there is no CAN interface can77|kernel has no CAN"):
         open_port("can://socketcan/can77", can_profile)
 
@@ -158,12 +186,20 @@ def adapter():
     os.close(far)
 
 
+def commands(far: int, wanted: bytes) -> bool:
+    """Read what the adapter is told until the wanted commands have come."""
+    got = bytearray()
+    while wanted not in got and select.select([far], [], [], DEADLINE_S)[0]:
+        got += os.read(far, 100)
+    return wanted in got
+
+
 def test_an_slcan_adapter_is_opened_by_its_path_and_set_to_the_bit_rate(
     adapter, can_profile, opened, arrivals
 ):
     far, path = adapter
     port = opened(f"can://slcan/{path}?sleep_after_open=0", can_profile)
-    assert b"S8\r" in os.read(far, 100)  # 1 Mbit/s
+    assert commands(far, b"S8\r")  # 1 Mbit/s
     os.write(far, b"\r\at1503010203\rtXYZ3\rt1518" + b"0011223344556677\r")
     messages = np.concatenate([arrival.data for arrival in arrivals(port, 2)])
     assert messages["id"].tolist() == [0x150, 0x151]
@@ -173,29 +209,39 @@ def test_an_slcan_adapter_is_opened_by_its_path_and_set_to_the_bit_rate(
 def test_an_slcan_adapter_gets_the_data_bit_rate_of_a_can_fd_profile(adapter, canfd, opened):
     far, path = adapter
     opened(f"can://slcan/{path}?sleep_after_open=0", canfd)
-    assert b"S8\rY5\r" in os.read(far, 100)
+    assert commands(far, b"S8\rY5\r")
 
 
-def test_an_slcan_adapter_that_is_pulled_is_lost_and_leaves_nothing_open(can_profile):
+def test_an_unplugged_slcan_adapter_is_lost_and_leaves_nothing_open(can_profile):
     far, near = os.openpty()
     tty.setraw(near)
+    before = descriptors()
     port = open_port(f"can://slcan/{os.ttyname(near)}?sleep_after_open=0", can_profile)
-    held = len(os.listdir("/proc/self/fd"))
+    opened = descriptors() - before
+    assert len(opened) >= 5, "the device and four ends of pipes"
     os.close(far)
     with pytest.raises(PortLostError):
         port.read(1)
     port.close()
-    # The far end, and what pyserial holds: the device and four ends of pipes.
-    assert len(os.listdir("/proc/self/fd")) == held - 1 - 5
+    assert not opened & descriptors()
     os.close(near)
 
 
-def test_an_slcan_adapter_that_is_not_there_names_the_ports_that_are(can_profile):
+def descriptors() -> set[tuple[str, str]]:
+    """Open descriptors of this process, and what each one is of: other threads have theirs."""
+    found = set()
+    for fd in os.listdir("/proc/self/fd"):
+        with suppress(OSError):  # closed since
+            found.add((fd, os.readlink(f"/proc/self/fd/{fd}")))
+    return found
+
+
+def test_an_absent_slcan_adapter_is_reported_with_the_existing_ports(can_profile):
     with pytest.raises(PortLostError, match=r"there is no /dev/no-such; there (are|is)"):
         open_port("can://slcan//dev/no-such", can_profile)
 
 
-def test_an_interface_that_cannot_be_used_here_is_the_users_mistake(can_profile):
+def test_an_unusable_interface_is_a_mistake_of_the_user(can_profile):
     with pytest.raises(InputError, match="bitrate: expected at most 1000000"):
         open_port("can://virtual/x?bitrate=2000000", can_profile)
     with pytest.raises(InputError, match="Invalid bitrate, choose one of"):
@@ -213,14 +259,14 @@ with can.Bus({GROUP!r}, "udp_multicast", port=int(sys.argv[1]), ignore_config=Tr
 """
 
 
-def test_messages_of_another_process_come_all_in_order_and_a_strangers_datagram_is_ignored(canfd, opened):
+def test_messages_of_another_process_arrive_in_order_and_a_foreign_datagram_is_ignored(canfd, opened):
     pytest.importorskip("msgpack")
-    number = 20_000 + os.getpid() % 20_000
+    number = free_port()
     port = opened(f"can://udp_multicast/{GROUP}?port={number}", canfd)
     command = [sys.executable, "-c", SENDER, str(number)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, text=True) as sender:
         found, asked = [], 0
-        deadline = time.monotonic() + 20
+        deadline = time.monotonic() + DEADLINE_S
         while asked < 2000:  # a hundred on the way at the most: UDP may lose what a buffer cannot hold
             print(asked, asked + 100, file=sender.stdin, flush=True)
             asked += 100

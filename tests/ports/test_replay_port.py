@@ -6,9 +6,9 @@ from mcap.writer import Writer
 
 from imudrv import Source
 from imudrv.errors import InputError
-from imudrv.ports import PortEndedError, PortLostError, open_port
+from imudrv.ports import PortEndedError, PortLostError, open_port, replay
 from imudrv.recording.format import BYTES, CAN_MESSAGES, WIRE, pack_messages
-from imudrv.records import MESSAGE
+from imudrv.records import MESSAGE, Arrival
 from imudrv.wire.candump import format_candump
 
 FRAME = 44  # bytes of imu50-rs422
@@ -50,7 +50,9 @@ def _same(one, other):
 
 
 @pytest.mark.parametrize("speed", ["max", "100", "1000000"])
-def test_a_capture_comes_whole_with_the_time_of_each_pieces_end(speed, capture, rs422, opened, to_the_end):
+def test_a_capture_is_replayed_complete_with_the_time_of_each_pieces_end(
+    speed, capture, rs422, opened, to_the_end
+):
     port = opened(f"replay://{capture}?speed={speed}", rs422)
     assert port.source is Source.REPLAY
     found = to_the_end(port)
@@ -60,7 +62,7 @@ def test_a_capture_comes_whole_with_the_time_of_each_pieces_end(speed, capture, 
     assert all(len(arrival.data) % FRAME == 0 for arrival in found[:-1])
 
 
-def test_at_its_own_pace_a_capture_comes_frame_by_frame(rs422, tmp_path, opened, to_the_end):
+def test_in_real_time_a_capture_is_replayed_frame_by_frame(rs422, tmp_path, opened, to_the_end):
     capture = tmp_path / "short.raw"
     capture.write_bytes(bytes(50 * FRAME))
     found = to_the_end(opened(f"replay://{capture}", rs422))
@@ -75,7 +77,7 @@ def test_a_replay_is_the_same_each_time(speed, capture, log, rs422, can_profile,
 
 
 @pytest.mark.parametrize("speed", ["max", "50"])
-def test_a_candump_log_comes_whole_with_its_own_times(speed, log, can_profile, opened, to_the_end):
+def test_a_candump_log_is_replayed_complete_with_its_own_times(speed, log, can_profile, opened, to_the_end):
     found = to_the_end(opened(f"replay://{log}?speed={speed}", can_profile))
     messages = np.concatenate([arrival.data for arrival in found])
     assert np.array_equal(messages, _messages(4000))
@@ -83,7 +85,7 @@ def test_a_candump_log_comes_whole_with_its_own_times(speed, log, can_profile, o
     assert all(arrival.data.flags.writeable for arrival in found)
 
 
-def test_a_line_that_is_no_message_costs_no_other(can_profile, tmp_path, opened, to_the_end):
+def test_a_line_that_is_no_message_affects_no_other(can_profile, tmp_path, opened, to_the_end):
     lines = format_candump(_messages(6)).splitlines(keepends=True)
     log = tmp_path / "damaged.log"
     log.write_bytes(b"".join(lines[:3]) + b"(17000000 can0 #\n\xff\xfe\n" + b"".join(lines[3:])[:-1])
@@ -91,7 +93,7 @@ def test_a_line_that_is_no_message_costs_no_other(can_profile, tmp_path, opened,
     assert np.array_equal(np.concatenate([arrival.data for arrival in found]), _messages(6))
 
 
-def test_a_log_of_two_channels_is_refused_where_the_second_one_comes(
+def test_a_log_of_two_channels_is_refused_where_the_second_one_appears(
     can_profile, tmp_path, opened, to_the_end
 ):
     messages, log = _messages(4000), tmp_path / "two.log"
@@ -112,22 +114,23 @@ def _recording(path, encoding, reads):
         writer = Writer(file)
         writer.start()
         channel = writer.register_channel(WIRE, encoding, 0)
-        for t_ns, data in reads:
+        for t_ns, data, *_ in reads:
             writer.add_message(channel, t_ns, data, t_ns)
         writer.finish()
     return path
 
 
 @pytest.mark.parametrize("speed", ["max", "50"])
-def test_a_recording_comes_read_by_read_with_its_times(speed, rs422, tmp_path, opened, to_the_end):
+def test_a_recording_is_replayed_read_by_read_with_its_times(speed, rs422, tmp_path, opened, to_the_end):
     start = 1_700_000_000_123_456_789
-    reads = [(start + k * 3 * MS, bytes([k % 256] * (1 + k % 50))) for k in range(500)]
+    reads = [Arrival(start + k * 3 * MS, bytes([k % 256] * (1 + k % 50))) for k in range(500)]
     path = _recording(tmp_path / "unit.mcap", BYTES, reads)
-    assert to_the_end(opened(f"replay://{path}?speed={speed}", rs422)) == reads
+    found = to_the_end(opened(f"replay://{path}?speed={speed}", rs422))
+    assert list(found) == reads
 
 
 @pytest.mark.parametrize("speed", ["max", "50"])
-def test_a_recording_of_messages_comes_with_the_time_of_each(
+def test_a_recording_of_messages_is_replayed_with_the_time_of_each(
     speed, can_profile, tmp_path, opened, to_the_end
 ):
     messages = np.split(_messages(600), 200)
@@ -138,7 +141,7 @@ def test_a_recording_of_messages_comes_with_the_time_of_each(
     assert np.array_equal(np.concatenate([arrival.data for arrival in found]), _messages(600))
 
 
-def test_a_recording_of_another_kind_of_unit_is_the_users_mistake(rs422, can_profile, tmp_path):
+def test_a_recording_of_another_kind_of_unit_is_a_mistake_of_the_user(rs422, can_profile, tmp_path):
     serial = _recording(tmp_path / "serial.mcap", BYTES, [(1, b"x")])
     with pytest.raises(InputError, match="for profile imu50-can, got one of bytes of a serial line"):
         open_port(f"replay://{serial}", can_profile)
@@ -153,17 +156,20 @@ def test_a_recording_without_a_read_is_at_its_end(rs422, tmp_path, opened):
         opened(f"replay://{path}", rs422).read(0)
 
 
-def test_no_piece_comes_before_its_time(rs422, tmp_path, opened):
+def test_no_piece_is_replayed_before_its_time(rs422, tmp_path, opened, monkeypatch):
+    clock = [10**18]
+    monkeypatch.setattr(replay, "now_ns", lambda: clock[0])
+    monkeypatch.setattr(time, "sleep", lambda s: clock.append(clock.pop() + round(s * 1e9)))
     capture = tmp_path / "slow.raw"
     capture.write_bytes(bytes(2 * FRAME))
     port = opened(f"replay://{capture}?speed=0.005", rs422)  # a frame each 0.2 s
-    begin = time.monotonic()
     assert len(port.read(0).data) == FRAME
     assert port.read(0).data == b""
-    assert 1 * MS <= port.read(0.001).t_ns < 2 * MS
+    early = port.read(0.04)
+    assert (early.data, early.t_ns) == (b"", 1.2 * MS)
     while not port.read(0.05).data:
         pass
-    assert time.monotonic() - begin >= 0.2  # no upper limit: a machine may be slow
+    assert clock[0] == 10**18 + 200 * MS
 
 
 def test_a_pause_of_a_log_is_kept(can_profile, tmp_path, opened):
@@ -178,7 +184,7 @@ def test_a_pause_of_a_log_is_kept(can_profile, tmp_path, opened):
     assert nothing.size == 0
 
 
-def test_the_end_is_told_each_time_it_is_reached(capture, rs422, opened, to_the_end):
+def test_the_end_is_reported_each_time_it_is_reached(capture, rs422, opened, to_the_end):
     port = opened(f"replay://{capture}?speed=max", rs422)
     to_the_end(port)
     for _ in range(2):
@@ -194,7 +200,7 @@ def test_a_closed_replay_is_lost_when_read(capture, rs422, opened):
         port.read(0)
 
 
-def test_a_file_that_cannot_be_replayed_is_the_users_mistake(capture, rs422, can_profile, tmp_path):
+def test_a_file_that_cannot_be_replayed_is_a_mistake_of_the_user(capture, rs422, can_profile, tmp_path):
     empty = tmp_path / "empty.raw"
     empty.touch()
     with pytest.raises(InputError, match="expected a file to replay, got an empty one"):

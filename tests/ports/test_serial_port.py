@@ -1,19 +1,25 @@
+import fcntl
 import os
 import socket
+import struct
+import subprocess
+import sys
 import termios
 import threading
 import tty
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 import serial
+from realtime import DEADLINE_S
 
 from imudrv import Source
 from imudrv.errors import InputError
 from imudrv.hostclock import now_ns
 from imudrv.ports import PortLostError, open_port
-from imudrv.ports.serial import DescriptorPort, PyserialPort, explain
+from imudrv.ports.serial import DescriptorPort, PyserialPort, explain, take_exclusively
 
 MANY = bytes(range(256)) * 12  # less than the 4 KiB that a pty holds; has every byte that a terminal may eat
 
@@ -22,9 +28,9 @@ class Line:
     """A pty: we hold the unit's end, the driver gets the other one by its path."""
 
     def __init__(self) -> None:
-        self.unit, self._driver = os.openpty()
-        tty.setraw(self._driver)
-        self.path = os.ttyname(self._driver)
+        self.unit, self.descriptor = os.openpty()
+        tty.setraw(self.descriptor)
+        self.path = os.ttyname(self.descriptor)
 
     def pull(self) -> None:
         if self.unit >= 0:
@@ -33,7 +39,7 @@ class Line:
 
     def close(self) -> None:
         self.pull()
-        os.close(self._driver)
+        os.close(self.descriptor)
 
 
 @pytest.fixture
@@ -56,7 +62,7 @@ def _url(server: socket.socket) -> str:
 @pytest.mark.parametrize(
     "form", ["{}", "serial://{}", "serial://{}?baudrate=115200", "alt://{}?class=VTIMESerial"]
 )
-def test_bytes_come_whole_and_stamped_when_they_came(form, line, rs422, opened, arrivals):
+def test_bytes_are_received_complete_and_stamped_on_arrival(form, line, rs422, opened, arrivals):
     port = opened(form.format(line.path), rs422)
     assert isinstance(port, DescriptorPort)
     assert port.source is Source.HARDWARE
@@ -69,7 +75,7 @@ def test_bytes_come_whole_and_stamped_when_they_came(form, line, rs422, opened, 
     assert port.read(0).data == b""
 
 
-def test_a_line_that_is_spied_on_is_read_through_pyserial(line, rs422, opened, arrivals, capfd):
+def test_a_spy_url_is_read_through_pyserial(line, rs422, opened, arrivals, capfd):
     port = opened(f"spy://{line.path}", rs422)
     assert isinstance(port, PyserialPort)
     os.write(line.unit, MANY)
@@ -81,7 +87,7 @@ def test_a_line_that_is_spied_on_is_read_through_pyserial(line, rs422, opened, a
     assert "F1 F2 F3 F4" in capfd.readouterr().err
 
 
-def test_what_a_port_holds_when_it_is_opened_is_not_thrown_away(line, rs422, opened, arrivals):
+def test_bytes_buffered_before_opening_are_not_discarded(line, rs422, opened, arrivals):
     os.write(line.unit, MANY)
     port = opened(line.path, rs422)
     assert b"".join(arrival.data for arrival in arrivals(port, len(MANY))) == MANY
@@ -112,14 +118,52 @@ def test_a_port_pulled_while_a_read_waits_is_lost(line, rs422, opened):
     pulling = threading.Timer(0.1, line.pull)
     pulling.start()
     with pytest.raises(PortLostError, match=r"the (port is gone|other end has gone)"):
-        port.read(20)
+        port.read(DEADLINE_S)
     pulling.join()
 
 
 def test_a_port_that_another_one_has_open_is_busy(line, rs422, opened):
     opened(line.path, rs422)
-    with pytest.raises(PortLostError, match=r"another program has /dev/pts/.* open; end it \(`fuser -v"):
+    with pytest.raises(PortLostError, match=r"/dev/pts/.* is open in another program \(`sudo fuser -v"):
         open_port(line.path, rs422)
+
+
+def test_the_program_that_has_a_port_open_is_named(line, rs422):
+    program = (
+        f"import serial, sys; line = serial.Serial({line.path!r}, exclusive=True); "
+        "print(flush=True); sys.stdin.read()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as other:
+        other.stdout.readline()
+        with pytest.raises(PortLostError, match=rf"is open in \S+ \(process {other.pid}\)"):
+            open_port(line.path, rs422)
+        other.communicate(b"")
+
+
+def test_a_line_is_taken_exclusively_but_not_a_pty_which_its_other_end_would_keep_taken(line, rs422, opened):
+    def is_exclusive(descriptor):
+        return bool(struct.unpack("i", fcntl.ioctl(descriptor, 0x80045440, bytes(4)))[0])  # TIOCGEXCL
+
+    opened(line.path, rs422)
+    assert not is_exclusive(line.descriptor)
+    take_exclusively(line.descriptor)
+    assert is_exclusive(line.descriptor)
+    with open("/dev/null") as null:
+        take_exclusively(null.fileno())  # has no such flag
+
+
+def test_errors_that_the_driver_has_counted_are_reported_and_a_pty_counts_none(
+    line, rs422, opened, monkeypatch
+):
+    port = opened(line.path, rs422)
+    before = port.line_errors()
+    assert not any(before)
+    # linux/serial.h: cts, dsr, rng, dcd, rx, tx, frame, overrun, parity, brk, buf_overrun, reserved
+    counts = struct.pack("20i", 0, 0, 0, 0, 9000, 0, 12, 3, 4, 7, 2, *[0] * 9)
+    monkeypatch.setattr("imudrv.ports.serial.fcntl.ioctl", lambda fd, request, room: counts)
+    assert str(port.line_errors().since(before)) == "12 framing errors, 4 parity errors, 5 overruns"
 
 
 def test_a_closed_port_is_closed_once_lost_when_read_and_free_for_others(line, rs422, opened):
@@ -155,7 +199,7 @@ def test_a_device_that_is_no_terminal_is_not_opened(rs422):
         (OSError(22, "Invalid argument"), InputError, r"Failed to set custom baud rate \(123457\)"),
     ],
 )
-def test_a_port_that_goes_while_it_is_opened_is_lost_and_a_speed_it_lacks_a_mistake(
+def test_a_port_that_vanishes_during_opening_is_lost_and_an_unsupported_speed_an_error(
     trouble, kind, message, line, rs422, monkeypatch
 ):
     def fail(self, speed):
@@ -171,7 +215,7 @@ def test_a_port_that_goes_while_it_is_opened_is_lost_and_a_speed_it_lacks_a_mist
         open_port(f"serial://{line.path}?baudrate=123457", rs422)
 
 
-def test_a_refusal_says_who_may_and_how_to_become_one(tmp_path):
+def test_a_refusal_names_the_group_with_access_and_how_to_join_it(tmp_path):
     device = tmp_path / "tty"
     device.touch()
     text = explain(str(device), PermissionError(13, "Permission denied"))
@@ -179,25 +223,26 @@ def test_a_refusal_says_who_may_and_how_to_become_one(tmp_path):
     assert f"no permission for {device}; its group is {group}: `sudo usermod -aG {group} $USER`" in text
 
 
-def test_the_stream_of_a_tcp_server_comes_whole_from_its_first_byte(server, rs422, opened, arrivals):
+def test_the_stream_of_a_tcp_server_is_received_complete(server, rs422, opened, arrivals):
     port = opened(_url(server), rs422)
-    with server.accept()[0] as unit:
-        unit.sendall(MANY * 40)
+    with server.accept()[0] as unit, ThreadPoolExecutor(1) as pool:
+        sending = pool.submit(unit.sendall, MANY * 40)  # perhaps more than the system holds
         assert b"".join(arrival.data for arrival in arrivals(port, len(MANY) * 40)) == MANY * 40
+        sending.result()
         assert port.read(0).data == b""
 
 
-def test_a_tcp_server_that_hangs_up_is_a_lost_port_after_its_last_byte(server, rs422, opened):
+def test_a_tcp_server_that_closes_is_a_lost_port_after_its_last_byte(server, rs422, opened):
     port = opened(_url(server), rs422)
     with server.accept()[0] as unit:
         unit.sendall(b"last")
-    assert port.read(20).data == b"last"
+    assert port.read(DEADLINE_S).data == b"last"
     for _ in range(2):
         with pytest.raises(PortLostError, match=r"(the other end has gone|the port is gone)"):
-            port.read(20)
+            port.read(DEADLINE_S)
 
 
-def test_a_tcp_server_that_is_not_there_is_a_lost_port(server, rs422):
+def test_an_absent_tcp_server_is_a_lost_port(server, rs422):
     url = _url(server)
     server.close()
     with pytest.raises(PortLostError, match=r"cannot connect: Connection refused; is the server running\?"):
@@ -227,11 +272,11 @@ def test_a_loop_is_read_through_pyserial(rs422, opened, arrivals, monkeypatch):
 @pytest.mark.parametrize(
     "url", ["loop://?colour=red", "rfc2217://127.0.0.1:1?colour=red", "alt:///dev/x?class=No"]
 )
-def test_an_option_that_pyserial_does_not_know_is_the_users_mistake(url, rs422):
+def test_an_option_unknown_to_pyserial_is_a_mistake_of_the_user(url, rs422):
     with pytest.raises(InputError, match=r"unknown option: 'colour'|unknown class: 'No'"):
         open_port(url, rs422)
 
 
-def test_a_port_described_to_pyserial_that_is_not_there_is_lost(rs422):
+def test_an_absent_port_given_by_a_pyserial_url_is_lost(rs422):
     with pytest.raises(PortLostError, match="no ports found matching"):
         open_port("hwgrep://no-such-device", rs422)

@@ -6,13 +6,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from imudrv.errors import InputError
 from imudrv.records import MESSAGE
 from imudrv.sim.faults import Damage, Kind, MessageFaults, StreamFaults
 from imudrv.sim.scenario import Faults, Scenario
 
 HEADER = b"\xeb\x90"
 LENGTH = 44
+KINDS = [(LENGTH, HEADER)]
 STREAM_RATES = {
     "bit_flips": 0.05,
     "bytes_lost": 0.06,
@@ -50,15 +50,15 @@ def send(line: StreamFaults, n: int) -> tuple[np.ndarray, bytes, Damage]:
 
 
 def test_a_quiet_line_changes_nothing(faults: Callable[..., Faults]) -> None:
-    frames, stream, damage = send(StreamFaults(faults(), HEADER, 1), 100)
+    frames, stream, damage = send(StreamFaults(faults(), KINDS, 1), 100)
     assert stream == frames.tobytes()
     assert not damage.hit.any()
     assert not damage.kind.any()
 
 
-def test_every_kind_comes_as_often_as_its_rate(faults: Callable[..., Faults]) -> None:
+def test_every_kind_of_fault_occurs_at_its_rate(faults: Callable[..., Faults]) -> None:
     n = 20_000
-    _, _, damage = send(StreamFaults(faults(stream=STREAM_RATES), HEADER, 1), n)
+    _, _, damage = send(StreamFaults(faults(stream=STREAM_RATES), KINDS, 1), n)
     for kind, rate in zip(list(Kind)[1:9], STREAM_RATES.values(), strict=True):
         sigma = np.sqrt(rate * (1 - rate) / n)
         assert np.mean(damage.kind == kind) == pytest.approx(rate, abs=4 * sigma), kind  # four sigma
@@ -66,7 +66,7 @@ def test_every_kind_comes_as_often_as_its_rate(faults: Callable[..., Faults]) ->
 
 
 def test_frames_that_are_not_hit_arrive_and_the_others_do_not(faults: Callable[..., Faults]) -> None:
-    frames, stream, damage = send(StreamFaults(faults(stream=STREAM_RATES), HEADER, 3), 3000)
+    frames, stream, damage = send(StreamFaults(faults(stream=STREAM_RATES), KINDS, 3), 3000)
     at = 0
     for frame, hit, kind in zip(frames, damage.hit, damage.kind, strict=True):
         found = stream.find(frame.tobytes(), at)
@@ -94,7 +94,7 @@ def test_frames_that_are_not_hit_arrive_and_the_others_do_not(faults: Callable[.
 def test_each_kind_does_what_its_name_says(
     faults: Callable[..., Faults], key: str, shortest: int, longest: int
 ) -> None:
-    line = StreamFaults(faults(stream={key: 1.0}), HEADER, 5)
+    line = StreamFaults(faults(stream={key: 1.0}), KINDS, 5)
     for frame in frames_of(200):
         stream, damage = line.apply(frame[None], times(1))
         assert shortest <= len(stream) <= longest
@@ -115,7 +115,7 @@ def test_a_loss_that_the_next_header_would_heal_is_not_done(seed: int) -> None:
     frame = np.full((1, 3), 0xEB, np.uint8)
     frame[0, 1] = 0x11
     faults = Faults.model_validate({"stream": {"bytes_lost": 1.0}})
-    stream, damage = StreamFaults(faults, b"\xeb", seed).apply(frame, times(1))
+    stream, damage = StreamFaults(faults, [(frame.size, b"\xeb")], seed).apply(frame, times(1))
     assert stream not in (b"\xeb\x11",)
     assert damage.hit[0] == (stream != frame.tobytes())
 
@@ -123,7 +123,7 @@ def test_a_loss_that_the_next_header_would_heal_is_not_done(seed: int) -> None:
 def test_a_frame_that_no_damage_can_harm_is_left_whole() -> None:
     frame = np.zeros((1, 4), np.uint8)
     faults = Faults.model_validate({"stream": {"false_sync_inside": 1.0}})
-    stream, damage = StreamFaults(faults, b"\0\0", 1).apply(frame, times(1))
+    stream, damage = StreamFaults(faults, [(frame.size, b"\0\0")], 1).apply(frame, times(1))
     assert stream == frame.tobytes()
     assert not damage.hit[0]
     assert damage.kind[0] == Kind.NONE
@@ -131,7 +131,7 @@ def test_a_frame_that_no_damage_can_harm_is_left_whole() -> None:
 
 def test_in_a_silence_nothing_is_sent(faults: Callable[..., Faults]) -> None:
     quiet = faults(silences=[{"at_s": 0.05, "duration_s": 0.02}])
-    frames, stream, damage = send(StreamFaults(quiet, HEADER, 1), 100)
+    frames, stream, damage = send(StreamFaults(quiet, KINDS, 1), 100)
     expected = np.zeros(100, np.bool_)
     expected[50:70] = True  # frame k is sent at k + 1 ms
     np.testing.assert_array_equal(damage.hit, expected)
@@ -142,7 +142,7 @@ def test_the_same_seed_gives_the_same_faults_in_any_chunks(faults: Callable[...,
     rates = faults(stream=STREAM_RATES)
 
     def in_chunks(seed: int, chunks: int) -> bytes:
-        line = StreamFaults(rates, HEADER, seed)
+        line = StreamFaults(rates, KINDS, seed)
         parts = np.array_split(frames_of(500), chunks)
         return b"".join(line.apply(part, times(len(part)))[0] for part in parts)
 
@@ -152,7 +152,7 @@ def test_the_same_seed_gives_the_same_faults_in_any_chunks(faults: Callable[...,
 
 def test_the_sizes_cut_the_stream_into_what_arrives_of_each_frame(faults: Callable[..., Faults]) -> None:
     rates = faults(stream=STREAM_RATES, silences=[{"at_s": 0.1, "duration_s": 0.1}])
-    frames, stream, damage = send(StreamFaults(rates, HEADER, 4), 500)
+    frames, stream, damage = send(StreamFaults(rates, KINDS, 4), 500)
     assert damage.size.sum() == len(stream)
     ends = np.cumsum(damage.size)
     for frame, size, end, kind in zip(frames, damage.size, ends, damage.kind, strict=True):
@@ -165,16 +165,11 @@ def test_the_sizes_cut_the_stream_into_what_arrives_of_each_frame(faults: Callab
 def test_a_cable_that_is_out_is_a_silence(faults: Callable[..., Faults]) -> None:
     span = [{"at_s": 0.05, "duration_s": 0.02}]
     for kind in (
-        StreamFaults(faults(unplugs=span), HEADER, 1),
-        StreamFaults(faults(silences=span), HEADER, 1),
+        StreamFaults(faults(unplugs=span), KINDS, 1),
+        StreamFaults(faults(silences=span), KINDS, 1),
     ):
         frames, stream, _ = send(kind, 100)
         assert stream == frames[:50].tobytes() + frames[70:].tobytes()
-
-
-def test_frames_without_times_are_refused(faults: Callable[..., Faults]) -> None:
-    with pytest.raises(InputError, match="n frames of 2 bytes or more and n times"):
-        StreamFaults(faults(), HEADER, 1).apply(frames_of(3), times(2))
 
 
 def messages_of(n: int) -> Any:
@@ -190,7 +185,7 @@ def test_a_quiet_bus_changes_nothing(faults: Callable[..., Faults]) -> None:
     assert not damage.hit.any()
 
 
-def test_messages_are_lost_doubled_and_swapped_as_told(faults: Callable[..., Faults]) -> None:
+def test_messages_are_lost_doubled_and_swapped_as_reported(faults: Callable[..., Faults]) -> None:
     n = 20_000
     sent = messages_of(n)
     got, damage = MessageFaults(faults(can={"lost": 0.05, "doubled": 0.1, "swapped": 0.05}), 1).apply(sent)
@@ -239,3 +234,28 @@ def test_a_bus_falls_silent_too(faults: Callable[..., Faults]) -> None:
     )
     np.testing.assert_array_equal(got["id"], np.arange(10, 30))
     np.testing.assert_array_equal(damage.hit, np.arange(30) < 10)
+
+
+def test_each_message_of_a_sample_has_its_own_faults(faults: Callable[..., Faults]) -> None:
+    """Three messages a sample: rates are per message, and the bytes of the others are as they were."""
+    kinds = [(11, b"\x55\x51"), (9, b"\x55\x52"), (5, b"\x56")]
+    n = 2000
+    rows = np.random.default_rng(1).integers(0, 256, (n, 25), np.uint8)
+    t_ns = np.repeat(times(n), 3)
+    whole = faults(stream={"frame_lost": 0.1})
+    stream, damage = StreamFaults(whole, kinds, 5).apply(rows, t_ns)
+    assert damage.hit.shape == (3 * n,)
+    for k, (length, _) in enumerate(kinds):
+        lost = damage.hit[k::3]
+        assert abs(lost.mean() - 0.1) < 4 * np.sqrt(0.1 * 0.9 / n)  # four sigma
+        np.testing.assert_array_equal(damage.size[k::3], np.where(lost, 0, length))
+    starts = np.array([0, 11, 20])
+    kept = [
+        rows[i // 3, starts[i % 3] : starts[i % 3] + kinds[i % 3][0]].tobytes()
+        for i in np.flatnonzero(~damage.hit)
+    ]
+    assert stream == b"".join(kept)
+    # any pieces, the same faults
+    line = StreamFaults(whole, kinds, 5)
+    pieces = [line.apply(rows[a:b], t_ns[3 * a : 3 * b])[0] for a, b in ((0, 7), (7, 1000), (1000, n))]
+    assert b"".join(pieces) == stream

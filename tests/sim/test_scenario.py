@@ -4,6 +4,7 @@ from typing import Any
 
 import pytest
 
+from imudrv import profiles
 from imudrv.calibration import Calibration
 from imudrv.errors import FaultyFileError, InputError
 from imudrv.files.settings_file import write
@@ -23,7 +24,7 @@ motion:
 @pytest.mark.parametrize("name", shipped())
 def test_a_shipped_scenario_loads_and_runs(name: str) -> None:
     scenario = load(name)
-    chunk = next(simulate(scenario, 1_000_000, 10))
+    chunk = next(simulate(scenario, profiles.load("imu50-rs422").layout(), 10))
     assert chunk.pulses.size == 10
     up = "xyz".index(scenario.start.pose[0])
     # g for 10 ms at 2000 pulses per m/s; noise and the dither of the arm are a pulse or two
@@ -35,7 +36,7 @@ def test_the_three_poses_of_the_bench_procedure_are_shipped() -> None:
     assert [load(name).start.pose for name in ("x-up", "y-up", "z-up")] == ["x_up", "y_up", "z_up"]
 
 
-def test_an_unknown_name_tells_the_known_ones() -> None:
+def test_an_unknown_name_is_reported_with_the_known_ones() -> None:
     with pytest.raises(
         InputError, match=r"scenario 'w-up': expected one of rocking, .*there is no such file"
     ):

@@ -1,18 +1,25 @@
 from collections.abc import Callable
+from dataclasses import replace
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
 import pytest
 
+from imudrv import profiles
 from imudrv.errors import InputError
+from imudrv.imu.coefficients import Coefficients
 from imudrv.nav.earth import earth_rate_n
 from imudrv.sim.scenario import NOMINAL, Scenario
-from imudrv.sim.unit import STATUS_OVERFLOW, STATUS_WARM_UP, Chunk, TrueUnit, draw_true_unit, simulate
+from imudrv.sim.unit import Chunk, draw_true_unit, simulate
 from imudrv.units import ARCSEC, DEG, DEG_PER_H, DEG_PER_SQRT_H, PPM, UG, URAD
+from imudrv.wire.layout import Layout
 
 Make = Callable[..., Scenario]
 
 MS = 1_000_000
+LAYOUT = profiles.load("imu50-rs422").layout()
+STATUS_WARM_UP, STATUS_OVERFLOW = 1 << 0, 1 << 10  # ICD, section 2
 REST = {"rest": {"duration_s": 2.0}}
 TURN = {"rotate": {"angle_deg": 90.0, "duration_s": 1.5, "axis_tilt_mrad": [3.0, 0.0]}}
 ROCK = {
@@ -54,11 +61,16 @@ FINE = {
 
 
 def run(scenario: Scenario, interval_ns: int = MS, chunk: int = 65_536) -> Chunk:
-    chunks = list(simulate(scenario, interval_ns, chunk))
+    chunks = list(simulate(scenario, replace(LAYOUT, interval=Fraction(interval_ns)), chunk))
     return Chunk(np.concatenate([c.pulses for c in chunks]), np.concatenate([c.truth for c in chunks]))
 
 
-def size_effect(unit: TrueUnit, got: Chunk) -> np.ndarray:
+def run_as(layout: Layout, scenario: Scenario) -> Chunk:
+    (chunk,) = simulate(scenario, layout)
+    return chunk
+
+
+def size_effect(unit: Coefficients, got: Chunk) -> np.ndarray:
     """Integral of `a_i . Omega r_i` by the formula of the compensation, from true rates."""
     tau = 1e-3
     w1 = got.truth["omega_ib_b"]
@@ -72,7 +84,7 @@ def size_effect(unit: TrueUnit, got: Chunk) -> np.ndarray:
     return out
 
 
-def test_pulses_taken_back_by_the_calibration_are_the_truth(scenario: Make) -> None:
+def test_pulses_converted_by_the_calibration_are_the_truth(scenario: Make) -> None:
     hot = {"start_degc": 40.0, "slope_k_per_h": 900.0}
     got = run(
         scenario(
@@ -84,7 +96,7 @@ def test_pulses_taken_back_by_the_calibration_are_the_truth(scenario: Make) -> N
             start={"pivot_offset_mm": [40, 30, 20]},
         )
     )
-    unit = draw_true_unit(scenario(REST, unit={"calibration": FINE}))
+    unit = draw_true_unit(scenario(REST, unit={"calibration": FINE}), LAYOUT)
     tau, warmer = 1e-3, got.pulses["temperature_degc"][:, :1] - 35.0
     k_g = np.array([0.001, 0.002, 0.0015]) * ARCSEC * (1 + warmer * np.array([10, -20, 30]) * PPM)
     b_g = (np.array([10, -20, 30]) + warmer * np.array([1, 2, -1])) * DEG_PER_H
@@ -102,7 +114,7 @@ def test_pulses_taken_back_by_the_calibration_are_the_truth(scenario: Make) -> N
 
 def test_the_fraction_of_a_pulse_is_never_lost(scenario: Make) -> None:
     coarse = scenario(REST, TURN, REST)
-    got, unit = run(coarse), draw_true_unit(coarse)
+    got, unit = run(coarse), draw_true_unit(coarse, LAYOUT)
     total = np.cumsum(got.pulses["gyro"], axis=0)
     exact = np.cumsum(got.truth["dtheta_b"] / unit.gyro_scale, axis=0)
     assert (
@@ -141,7 +153,7 @@ def test_any_chunk_gives_the_same_bits(scenario: Make) -> None:
 def test_noise_is_a_random_walk_of_the_stated_size(scenario: Make) -> None:
     noise = {"arw_deg_per_sqrt_h": 0.3, "vrw_m_s_per_sqrt_h": 0.6}
     noisy = scenario({"rest": {"duration_s": 100.0}}, unit={"calibration": FINE, "noise": noise})
-    pulses, unit = run(noisy).pulses, draw_true_unit(noisy)
+    pulses, unit = run(noisy).pulses, draw_true_unit(noisy, LAYOUT)
     gyro = pulses["gyro"] * unit.gyro_scale
     speed = pulses["accelerometer"] / unit.accelerometer_scale
     for samples in (1, 100):
@@ -165,7 +177,7 @@ def test_dither_of_the_case_rectifies_to_minus_half_its_rate_squared(scenario: M
         {"rest": {"duration_s": 1.0}}, unit={"calibration": {**FINE, "temperature": None}, "dither": dither}
     )
     still = scenario({"rest": {"duration_s": 1.0}}, unit={"calibration": {**FINE, "temperature": None}})
-    unit = draw_true_unit(still)
+    unit = draw_true_unit(still, LAYOUT)
     change = (run(shaking).pulses["accelerometer"] - run(still).pulses["accelerometer"]).sum(
         axis=0
     ) / unit.accelerometer_scale
@@ -275,10 +287,12 @@ def test_residuals_have_their_sigma_and_nothing_else_changes(scenario: Make) -> 
         "accelerometer_scale_ppm": 20.0,
         "accelerometer_misalignment_urad": 40.0,
     }
-    units = [draw_true_unit(scenario(REST, seed=seed, unit={"residuals": sigmas})) for seed in range(200)]
-    exact = draw_true_unit(scenario(REST))
+    units = [
+        draw_true_unit(scenario(REST, seed=seed, unit={"residuals": sigmas}), LAYOUT) for seed in range(200)
+    ]
+    exact = draw_true_unit(scenario(REST), LAYOUT)
 
-    def sigma(of: Callable[[TrueUnit], Any]) -> float:
+    def sigma(of: Callable[[Coefficients], Any]) -> float:
         return float(np.std([of(u) - of(exact) for u in units]))
 
     # 600 draws (1200 of the misalignments): four sigma are 4 / sqrt(1200)
@@ -296,7 +310,7 @@ def test_residuals_have_their_sigma_and_nothing_else_changes(scenario: Make) -> 
 
 
 def test_without_a_calibration_the_unit_is_the_nominal_one(scenario: Make) -> None:
-    unit = draw_true_unit(scenario(REST))
+    unit = draw_true_unit(scenario(REST), LAYOUT)
     assert NOMINAL.size_effect is not None
     np.testing.assert_array_equal(unit.r_b, NOMINAL.size_effect.r_m)
     np.testing.assert_array_equal(unit.gyro_scale, np.full(3, 0.5 * ARCSEC))
@@ -314,8 +328,33 @@ def test_gravity_absent_from_the_site_is_the_normal_one(scenario: Make) -> None:
     ("interval_ns", "chunk", "message"),
     [(0, 1, "10 us to 1 s, got 0 ns"), (MS, 0, "at least one sample, got 0")],
 )
-def test_an_interval_or_chunk_without_sense_is_refused(
+def test_an_invalid_interval_or_chunk_is_refused(
     scenario: Make, interval_ns: int, chunk: int, message: str
 ) -> None:
     with pytest.raises(InputError, match=message):
-        next(simulate(scenario(REST), interval_ns, chunk))
+        next(simulate(scenario(REST), replace(LAYOUT, interval=Fraction(interval_ns)), chunk))
+
+
+@pytest.mark.parametrize(("profile", "step"), [("ilabs-ga-200", 10), ("kvh1775", 1), ("hg4930", None)])
+def test_counter_and_status_are_those_of_the_profile(scenario: Make, profile: str, step: int | None) -> None:
+    layout = profiles.load(profile).layout()
+    got = run_as(layout, scenario(REST, start={"counter": 1000}, unit={"warm_up_s": 0.25}))
+    first = 0 if step is None else 1000  # samples without a number are counted from 0
+    np.testing.assert_array_equal(
+        got.pulses["counter"], first + (step or 1) * np.arange(len(got.pulses)), strict=False
+    )
+    # Bits that mean good are set, and no bit of a unit that has none for the warm-up changes.
+    assert set(got.pulses["status"].tolist()) == {layout.status.inverted}
+
+
+def test_an_axis_saturates_at_the_width_of_its_own_field(scenario: Make) -> None:
+    layout = profiles.load("tamagawa-serial").layout()  # rates of 16 bits of 200 / 2^15 deg/s
+    x, y, z = layout.gyro.axes
+    assert x is not None
+    narrow = layout.gyro._replace(axes=(x._replace(bits=15), y, z))
+    layout = replace(layout, gyro=narrow)
+    # The peak of minimum jerk is 1.875 times the mean: 675 deg/s.
+    spin = {"rotate": {"angle_deg": 720.0, "duration_s": 2.0, "axis_n": [0.0, 0.0, 1.0]}}
+    for pose, axis, limit in (("x_up", 0, 100.0), ("z_up", 2, 200.0)):
+        rate = run_as(layout, scenario(spin, start={"pose": pose})).pulses["gyro"][:, axis]
+        assert rate.max() == pytest.approx(limit * DEG * 0.005, rel=1e-4)  # less a count

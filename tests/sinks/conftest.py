@@ -1,8 +1,8 @@
-import time
 from collections.abc import Callable
 
 import numpy as np
 import pytest
+from realtime import until
 
 from imudrv.records import INCREMENTS, PULSES, Source
 from imudrv.sinks.base import Batch
@@ -37,12 +37,5 @@ def batch() -> BatchMaker:
 
 @pytest.fixture
 def wait_for() -> Waiter:
-    """Wait until something is so, for 20 s at the most."""
-
-    def wait(is_so: Callable[[], object]) -> None:
-        deadline = time.monotonic() + 20
-        while not is_so():
-            assert time.monotonic() < deadline, "it did not come about in 20 s"
-            time.sleep(0.005)
-
-    return wait
+    """Wait until something is so."""
+    return until

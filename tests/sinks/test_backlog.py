@@ -75,7 +75,7 @@ def test_no_write_is_larger_than_a_piece() -> None:
     assert sizes == [18 * SIZE, 18 * SIZE, 4 * SIZE]
 
 
-def test_a_consumer_that_is_gone_costs_what_waited() -> None:
+def test_a_consumer_that_is_gone_loses_what_was_queued() -> None:
     waiting, consumer = Backlog(1), Consumer()
     consumer.room = 10
     waiting.put(samples(0, 3), consumer.write)

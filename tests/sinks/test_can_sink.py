@@ -1,9 +1,12 @@
+import re
 import threading
+from itertools import count
 from pathlib import Path
 
 import can
 import numpy as np
 import pytest
+from realtime import DEADLINE_S
 
 from imudrv import profiles
 from imudrv.errors import InputError
@@ -19,7 +22,7 @@ SERIAL = profiles.load("imu50-rs422").layout()
 def receive(bus: can.BusABC, count: int) -> Records:
     messages = np.zeros(count, MESSAGE)
     for row in messages:
-        message = bus.recv(20)
+        message = bus.recv(DEADLINE_S)
         assert message is not None, "the sink stopped sending"
         row["id"], row["length"], row["fd"] = message.arbitration_id, message.dlc, message.is_fd
         row["data"][: message.dlc] = list(message.data)
@@ -45,11 +48,24 @@ def test_pulses_of_a_serial_unit_go_out_on_a_can_bus(batch, wait_for, profile: s
         sink.close()
 
 
+def test_identifiers_of_29_bits_are_sent_as_such(batch, wait_for, tmp_path: Path) -> None:
+    profile = tmp_path / "wide.yaml"
+    profile.write_bytes(profiles.content("imu50-can").replace(b"id: 0x150", b"id: 0x18FF0150"))
+    with can.Bus("wide gateway", "virtual") as bus:
+        sink = CanSink(f"can://virtual/wide gateway?profile={profile}", SERIAL)
+        wait_for(lambda: sink.state.state == "ok")
+        sink.publish(batch(0, 1))
+        received = [bus.recv(20) for _ in range(2)]
+        sink.close()
+    sent = [(m.arbitration_id, m.is_extended_id) for m in received if m is not None]
+    assert sent == [(0x18FF0150, True), (0x151, False)]
+
+
 def protocol(fd: bool) -> can.CanProtocol:
     return can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
 
 
-def test_what_the_outgoing_profile_cannot_say_is_dropped_and_counted(batch, wait_for) -> None:
+def test_samples_that_the_outgoing_profile_cannot_carry_are_dropped_and_counted(batch, wait_for) -> None:
     with can.Bus("narrow", "virtual") as bus:
         sink = CanSink("can://virtual/narrow?profile=imu50-can", SERIAL)
         wait_for(lambda: sink.state.state == "ok")
@@ -95,13 +111,15 @@ def test_temperatures_are_matched_by_sensor(
         sink.close()
 
 
-def test_a_driver_that_blocks_holds_nobody_and_costs_the_oldest_samples(batch, wait_for, monkeypatch) -> None:
+def test_a_blocking_driver_delays_nothing_else_and_loses_the_oldest_samples(
+    batch, wait_for, monkeypatch
+) -> None:
     go, begun = threading.Event(), threading.Event()
     send = can.interfaces.virtual.VirtualBus.send
 
     def slow(self: can.BusABC, message: can.Message, timeout: float | None = None) -> None:
         begun.set()
-        assert go.wait(20)
+        assert go.wait(DEADLINE_S)
         send(self, message, timeout)
 
     monkeypatch.setattr(can.interfaces.virtual.VirtualBus, "send", slow)
@@ -110,7 +128,7 @@ def test_a_driver_that_blocks_holds_nobody_and_costs_the_oldest_samples(batch, w
         sink = CanSink("can://virtual/slow?profile=imu50-canfd", SERIAL)
         wait_for(lambda: sink.state.state == "ok")
         sink.publish(batch(0, 1))
-        assert begun.wait(20)
+        assert begun.wait(DEADLINE_S)
         for n in range(1, 100):
             sink.publish(batch(n, 1))
         assert sink.state[3:] == (0, 50, 50)
@@ -121,7 +139,7 @@ def test_a_driver_that_blocks_holds_nobody_and_costs_the_oldest_samples(batch, w
         sink.close()
 
 
-def test_a_bus_that_is_not_there_or_fails_is_told_and_opened_again(batch, wait_for, monkeypatch) -> None:
+def test_an_absent_or_failing_bus_is_reported_and_reopened(batch, wait_for, monkeypatch) -> None:
     monkeypatch.setattr(can_sink, "_RETRY_S", 0.05)
     broken = True
     send = can.interfaces.virtual.VirtualBus.send
@@ -138,10 +156,12 @@ def test_a_bus_that_is_not_there_or_fails_is_told_and_opened_again(batch, wait_f
         sink.publish(batch(1, 10))
         wait_for(lambda: sink.state.dropped == 10)
         broken = False
-        wait_for(lambda: sink.state.state == "ok")
-        sink.publish(batch(11, 1))
-        receive(bus, 2)
-        wait_for(lambda: sink.state[1:] == ("ok", True, 1, 10, 0))
+        counters = count(11)
+        wait_for(lambda: sink.publish(batch(next(counters), 1)) or sink.state.sent)
+        wait_for(lambda: sink.state.queued == 0)
+        assert sink.state[1:3] == ("ok", True)
+        assert sink.state.sent + sink.state.dropped == next(counters) - 1
+        receive(bus, 2 * sink.state.sent)
         sink.close()
 
 
@@ -154,6 +174,32 @@ def test_a_bus_that_is_not_there_or_fails_is_told_and_opened_again(batch, wait_f
         ("can://virtual/x?profile=tools/psins-100hz.yaml", "psins-100hz"),
     ],
 )
-def test_a_gateway_that_cannot_be_is_refused(url: str, told: str) -> None:
+def test_an_impossible_gateway_is_refused(url: str, told: str) -> None:
     with pytest.raises(InputError, match=told):
         CanSink(url, SERIAL)
+
+
+@pytest.mark.parametrize(
+    ("unit", "profile", "found"),
+    [
+        (
+            "kvh1775",
+            "imu50-can",
+            "gyro: expected a profile for other units than pulses, as kvh1775 sends them",
+        ),
+        (
+            "exail-asterix",
+            "openimu-j1939",
+            "accelerometer: expected a profile for the axes that exail-asterix has",
+        ),
+    ],
+)
+def test_a_profile_that_cannot_carry_the_units_numbers_is_refused_with_the_reason(
+    unit: str, profile: str, found: str, tmp_path: Path
+) -> None:
+    layout = profiles.load(unit).layout()
+    outgoing = tmp_path / "outgoing.yaml"  # at the unit's rate, so that only the numbers differ
+    rate = f"sample_rate_hz: {1e9 / layout.interval_ns:g}".encode()
+    outgoing.write_bytes(re.sub(rb"sample_rate_hz: \d+", rate, profiles.content(profile)))
+    with pytest.raises(InputError, match=found):
+        CanSink(f"can://virtual/refused?profile={outgoing}", layout)

@@ -38,7 +38,7 @@ def test_rows_of_text_read_back_to_the_same_numbers(batch, tmp_path: Path) -> No
     assert np.array_equal(rows["dv_z"][:1000], sent.increments["dv_b"][:, 2])
 
 
-def test_a_full_disk_is_told_costs_the_oldest_samples_and_passes(
+def test_a_full_disk_is_reported_and_loses_the_oldest_samples_until_there_is_room(
     batch, wait_for, tmp_path: Path, monkeypatch
 ) -> None:
     room = 10_000
@@ -77,7 +77,7 @@ def test_a_full_disk_is_told_costs_the_oldest_samples_and_passes(
     assert (np.diff(numbers.astype(int)) > 0).all()
 
 
-def test_a_file_that_exists_is_not_touched(tmp_path: Path) -> None:
+def test_an_existing_file_is_not_changed(tmp_path: Path) -> None:
     path = tmp_path / "out.csv"
     path.write_text("mine")
     with pytest.raises(InputError, match=r"out\.csv: expected a new file"):
@@ -93,12 +93,12 @@ def test_a_file_that_exists_is_not_touched(tmp_path: Path) -> None:
         ("http://somewhere", "expected udp:, tcp:, serial:, can:, file: at the start, got 'http'"),
     ],
 )
-def test_a_way_out_that_cannot_be_is_refused(url: str, told: str) -> None:
+def test_an_invalid_output_is_refused(url: str, told: str) -> None:
     with pytest.raises(InputError, match=told):
         open_sink(url, profiles.load("imu50-rs422").layout())
 
 
-def test_every_way_out_is_opened_by_its_url(tmp_path: Path) -> None:
+def test_every_output_is_opened_by_its_url(tmp_path: Path) -> None:
     layout = profiles.load("imu50-rs422").layout()
     urls = {
         "udp://127.0.0.1:9": "UdpSink",

@@ -107,7 +107,7 @@ def test_after_a_restart_of_the_unit_the_newest_sample_of_a_number_is_meant() ->
     assert across[-1] == 99
 
 
-def test_a_history_that_was_cleared_begins_anew() -> None:
+def test_a_cleared_history_starts_again() -> None:
     layout = profiles.load("imu50-rs422").layout()
     history = History()
     filled(history, layout, wire(layout, 0, 50), 44)

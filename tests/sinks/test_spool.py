@@ -6,7 +6,7 @@ from imudrv.files import spool
 from imudrv.files.spool import AppendThread, Piece
 
 
-def test_a_round_ends_with_what_had_waited_though_more_comes_meanwhile(
+def test_a_round_ends_with_what_was_queued_at_its_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(spool, "PERIOD_S", 3600)  # so that the round at the end is the only one

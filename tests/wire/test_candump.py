@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from imudrv.errors import InputError
-from imudrv.records import MESSAGE, REJECT, Reason
+from imudrv.records import EXTENDED, MESSAGE, REJECT, Reason
 from imudrv.wire.candump import LONGEST_LINE, MOST_CHANNELS, CandumpDecoder, format_candump
 
 LINE = re.compile(
@@ -56,12 +56,18 @@ def read_by_expression(text: bytes, wanted: bytes | None):
         if match is not None:
             seconds, fraction, channel, identifier, fd, digits = match.groups()
             data = bytes.fromhex(digits.decode())
-            fits = int(identifier, 16) <= (0x7FF if len(identifier) == 3 else 0x1FFFFFFF)
+            number = int(identifier, 16) + (EXTENDED if len(identifier) == 8 else 0)
+            is_error = 0x20000000 <= number - EXTENDED <= 0x3FFFFFFF
+            fits = is_error or int(identifier, 16) <= (0x7FF if len(identifier) == 3 else 0x1FFFFFFF)
             if fits and len(data) <= (64 if fd else 8) and int(seconds) < 9_223_372_035:
+                if is_error:
+                    rejects.append((offset, len(line), Reason.ERROR_FRAME))
+                    offset += len(line)
+                    continue
                 t_ns = int(seconds) * 10**9 + int(fraction.ljust(9, b"0"))
                 wanted = channel if wanted is None else wanted
                 if channel == wanted:
-                    messages.append(record(t_ns, int(identifier, 16), data, fd is not None))
+                    messages.append(record(t_ns, number, data, fd is not None))
                 name = channel.decode("ascii", "backslashreplace")
                 channels[name] = channels.get(name, 0) + 1
             else:
@@ -79,8 +85,11 @@ GOOD = b"(1700000000.123456) can0 150#0001FFFF02004000\n"
     ("line", "message"),
     [
         (GOOD, record(1_700_000_000_123_456_000, 0x150, bytes.fromhex("0001FFFF02004000"))),
-        (b"(1.000000001) vcan-1 00000158##1abCD\r\n", record(1_000_000_001, 0x158, b"\xab\xcd", fd=True)),
-        (b"(0.5) can0 1FFFFFFF#\n", record(500_000_000, 0x1FFFFFFF, b"")),
+        (
+            b"(1.000000001) vcan-1 00000158##1abCD\r\n",
+            record(1_000_000_001, EXTENDED | 0x158, b"\xab\xcd", fd=True),
+        ),
+        (b"(0.5) can0 1FFFFFFF#\n", record(500_000_000, EXTENDED | 0x1FFFFFFF, b"")),
         (b"(0000000012.000000)  can0\t7ff#00 R\n", record(12 * 10**9, 0x7FF, b"\0")),
         (b"(12.000000) can0 7FF#00 T\r\n", record(12 * 10**9, 0x7FF, b"\0")),
         (b"(12.0) c 001##0" + b"5A" * 64 + b"\n", record(12 * 10**9, 1, b"\x5a" * 64, fd=True)),
@@ -104,7 +113,9 @@ def test_a_line_becomes_its_message(line, message):
         b"(1700000000.123456) can0 158##",
         b"(1700000000.123456) can0 1500#00",
         b"(1700000000.123456) can0 FFF#00",
-        b"(1700000000.123456) can0 20000000#00",
+        b"(1700000000.123456) can0 40000000#00",
+        b"(1700000000.123456) can0 60000004#0008000000000000",
+        b"(1700000000.123456) can0 20000004#000800000000000",
         b"(1700000000.123456) can0 150#00 X",
         b"(1700000000.123456) can0 150#00R",
         b"(1700000000.123456) can0150#00",
@@ -122,12 +133,30 @@ def test_a_line_becomes_its_message(line, message):
         b"x",
     ],
 )
-def test_a_bad_line_is_one_reject_and_costs_no_other(line):
+def test_a_bad_line_is_one_reject_and_affects_no_other(line):
     text = GOOD + line + b"\n" + GOOD
     messages, rejects = decoded(text)
     assert messages.size == 2
     assert messages[0] == messages[1]
     assert rejects.tolist() == [(len(GOOD), len(line) + 1, Reason.NOT_A_MESSAGE)]
+
+
+@pytest.mark.parametrize("identifier", [b"20000004", b"20000080", b"20000204", b"3fffffff"])
+def test_an_error_frame_is_a_reject_of_its_own_reason(identifier):
+    line = b"(1700000000.123456) can0 " + identifier + b"#0008000000000000"
+    messages, rejects = decoded(line + b"\n" + GOOD + line)
+    assert messages.size == 1
+    assert rejects.tolist() == [
+        (0, len(line) + 1, Reason.ERROR_FRAME),
+        (len(line) + 1 + len(GOOD), len(line), Reason.ERROR_FRAME),
+    ]
+
+
+def test_the_same_number_with_11_and_with_29_bits_is_two_identifiers():
+    messages, _ = decoded(b"(1.0) can0 150#00\n(1.0) can0 00000150#00\n")
+    assert messages["id"].tolist() == [0x150, EXTENDED | 0x150]
+    lines = format_candump(messages).splitlines()
+    assert [line.split()[-1] for line in lines] == [b"150#00", b"00000150#00"]
 
 
 def test_blank_lines_are_nothing():
@@ -161,7 +190,7 @@ def test_written_messages_are_read_again():
         [
             record(
                 int(random.integers(0, 2**62)) // 1000 * 1000,
-                int(random.integers(0, 0x800 if i % 2 else 0x20000000)),
+                int(random.integers(0, 0x800)) if i % 2 else EXTENDED | int(random.integers(0, 0x20000000)),
                 random.bytes(random.integers(0, 65 if fd else 9)),
                 fd,
             )
@@ -176,7 +205,7 @@ def test_written_messages_are_read_again():
 
 def test_written_text_is_what_candump_writes():
     classic = record(1_700_000_000_123_456_789, 0x150, bytes.fromhex("0001ffff02004000"))
-    fd = record(5_000_001_000, 0x18FF0001, b"\xab", fd=True)
+    fd = record(5_000_001_000, EXTENDED | 0x18FF0001, b"\xab", fd=True)
     assert format_candump(classic) == GOOD
     assert format_candump(fd, "can1") == b"(0000000005.000001) can1 18FF0001##1AB\n"
     assert format_candump(classic[:0]) == b""
@@ -195,7 +224,19 @@ LINES = st.one_of(
     st.tuples(
         st.sampled_from([b"(1.5)", b"(9999999999.5)", b"(0001.123456789)", b"(1.)"]),
         st.sampled_from([b" can0 ", b"\tc\r ", b" ", b" c0" * 2]),
-        st.sampled_from([b"150#", b"7FF#", b"800#", b"00000150##1", b"1fffffff#", b"150##", b"15#"]),
+        st.sampled_from(
+            [
+                b"150#",
+                b"7FF#",
+                b"800#",
+                b"00000150##1",
+                b"1fffffff#",
+                b"20000004#",
+                b"40000000#",
+                b"150##",
+                b"15#",
+            ]
+        ),
         st.integers(0, 66)
         .flatmap(lambda n: st.binary(min_size=n, max_size=n))
         .map(lambda b: b.hex().encode()),
@@ -233,7 +274,7 @@ def lines_of(*channels: str) -> bytes:
     return b"".join(format_candump(record(0, n, b""), channel) for n, channel in enumerate(channels))
 
 
-def test_only_the_first_or_the_chosen_channel_comes_out() -> None:
+def test_only_the_first_or_the_chosen_channel_is_decoded() -> None:
     log = lines_of("can1", "can0", "can1", "can10", "can", "can0")
     for channel, ids in ((None, [0, 2]), ("can1", [0, 2]), ("can0", [1, 5]), ("can", [4]), ("can2", [])):
         messages, rejects, channels = decoded_channel(channel, log)
@@ -247,7 +288,7 @@ def test_a_line_that_is_no_message_chooses_no_channel() -> None:
     assert (messages.size, channels) == (2, {"can0": 2})
 
 
-def test_a_log_of_more_channels_than_are_told_apart_is_counted_whole() -> None:
+def test_a_log_of_more_channels_than_are_distinguished_is_counted_completely() -> None:
     names = [f"can{n}" for n in range(MOST_CHANNELS + 3)]
     messages, _, channels = decoded_channel("can2", lines_of(*names * 2))
     assert messages["id"].tolist() == [2, 2 + len(names)]
@@ -283,7 +324,7 @@ def test_a_channel_that_is_not_in_the_log_is_refused_at_its_end(channel: str) ->
         decoder.check_channel("any.log", "--channel ")
 
 
-def test_names_of_channels_cannot_steer_a_terminal() -> None:
+def test_names_of_channels_cannot_control_a_terminal() -> None:
     decoder = CandumpDecoder()
     decoder.feed(b"(1.0) \x9b31m 150#00\n(1.0) \xe2\x80\xae 150#00\n")
     assert list(decoder.channels) == [r"\x9b31m", r"\xe2\x80\xae"]

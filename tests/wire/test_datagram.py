@@ -29,11 +29,11 @@ def worked_increment() -> Records:
     return increments
 
 
-def test_the_worked_datagram_of_the_icd_comes_out_byte_for_byte() -> None:
+def test_the_worked_datagram_of_the_icd_is_encoded_byte_for_byte() -> None:
     assert encode(worked_increment(), Source.SIMULATOR) == WORKED
 
 
-def test_the_worked_datagram_comes_back() -> None:
+def test_the_worked_datagram_is_decoded() -> None:
     received = DatagramDecoder().feed(WORKED)
     np.testing.assert_array_equal(received.increments, worked_increment())
     assert received.source.tolist() == [Source.SIMULATOR]
@@ -49,7 +49,7 @@ def test_the_counter_goes_out_modulo_two_to_the_32() -> None:
     cuts=st.lists(st.integers(0, 7 * SIZE), max_size=6),
     damage=st.lists(st.tuples(st.integers(0, 7 * SIZE - 1), st.integers(1, 255)), max_size=3),
 )
-def test_damage_costs_the_datagrams_it_hits_whatever_the_pieces(
+def test_damage_loses_only_the_damaged_datagrams_in_any_pieces(
     cuts: list[int], damage: list[tuple[int, int]]
 ) -> None:
     sent = np.repeat(worked_increment(), 7)

@@ -1,6 +1,7 @@
 """The encoders: the ICD's worked frame, and everything sent comes back through the decoders."""
 
 from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -10,7 +11,20 @@ from imudrv.profiles import load
 from imudrv.records import PULSES
 from imudrv.wire.can import CanAssembler
 from imudrv.wire.encode import CanEncoder, StreamEncoder
-from imudrv.wire.layout import COUNTER, STATUS, TEMPERATURE, Check, CheckKind, Field, Layout, Message
+from imudrv.wire.layout import (
+    GYRO,
+    SEQUENCE,
+    STATUS,
+    TEMPERATURE,
+    Check,
+    CheckKind,
+    Field,
+    Layout,
+    Message,
+    Sensor,
+    Sequence,
+    SequenceKind,
+)
 from imudrv.wire.stream import StreamDecoder
 
 RS422 = load("imu50-rs422").layout()
@@ -18,27 +32,34 @@ TOTALS = load("imu50-rs422-acc").layout()
 CAN = load("imu50-can").layout()
 CANFD = load("imu50-canfd").layout()
 
+
+def big(target: int, offset: int, bits: int, signed: bool) -> Field:
+    """A big-endian number of whole bytes."""
+    return Field(target, offset, bits // 8, 0, bits, signed, big_endian=True)
+
+
+GX, GY, GZ, AX, AY, AZ = (big(GYRO + axis, 4 + 3 * axis, 24, True) for axis in range(6))
+
 # A unit of another laboratory: other widths, order, sync and check than any shipped profile has.
 STRANGE = Layout(
     name="strange",
     can=False,
     fd=False,
-    big_endian=True,
-    interval_ns=2_500_000,
-    totals=False,
-    counter_bits=8,
-    pulse_bits=24,
+    interval=Fraction(2_500_000),
+    sequence=Sequence(SequenceKind.COUNTER, 8),
+    gyro=Sensor(axes=(GX, GY, GZ)),
+    accelerometer=Sensor(axes=(AX, AY, AZ)),
     messages=(
         Message(
             26,
             (
-                Field(COUNTER, 3, 8, False),
-                *(Field(1 + axis, 4 + 3 * axis, 24, True) for axis in range(6)),
-                Field(TEMPERATURE, 22, 8, False),
-                Field(STATUS, 23, 16, False),
+                big(SEQUENCE, 3, 8, False),
+                *(GX, GY, GZ, AX, AY, AZ),
+                big(TEMPERATURE, 22, 8, False),
+                big(STATUS, 23, 16, False),
             ),
-            ((0, 0xAA), (1, 0x55), (2, 0x01)),
-            Check(CheckKind.SUM, 8, 2, 25, 25),
+            constants=((0, 0xAA), (1, 0x55), (2, 0x01)),
+            checks=(Check(CheckKind.SUM, 8, ((2, 25),), 25),),
         ),
     ),
     temperature_names=("gyro",),
@@ -74,7 +95,7 @@ def worked_sample() -> np.ndarray:
     return pulses
 
 
-def test_the_worked_frame_of_the_icd_comes_out_byte_for_byte():
+def test_the_worked_frame_of_the_icd_is_encoded_byte_for_byte():
     (row,) = StreamEncoder(RS422).encode(worked_sample())
     assert row.tobytes() == WORKED
 
@@ -105,7 +126,7 @@ def test_what_a_stream_carries_is_decoded_to_the_same_numbers(layout):
     pulses = samples(1000, limit=layout.pulse_limit)
     frames, rejects = StreamDecoder(layout).feed(StreamEncoder(layout).encode(pulses).tobytes())
     assert rejects.size == 0
-    assert np.array_equal(frames["counter"], pulses["counter"] % 2**layout.counter_bits)
+    assert np.array_equal(frames["counter"], pulses["counter"] % 2**layout.sequence.bits)
     for name in ("gyro", "accelerometer", "status"):
         assert np.array_equal(frames[name], pulses[name])
     for channel, (scale, origin) in enumerate(zip(layout.degc_per_count, layout.degc_at_zero, strict=True)):
@@ -134,7 +155,7 @@ def test_totals_add_up_across_calls_and_wrap():
         assert np.array_equal(frames[name], totals % 65536)
 
 
-def test_a_refused_sample_does_not_move_the_totals():
+def test_a_refused_sample_does_not_change_the_totals():
     encoder = StreamEncoder(TOTALS)
     wild = samples()
     wild["gyro"] = 40_000
@@ -196,8 +217,10 @@ def test_a_counter_goes_out_modulo_its_width():
     assert frames["counter"].tolist() == [2**32 - 1, 0, 1]
 
 
-def test_byte_order_turns_the_bytes_of_each_number_round():
-    turned = replace(RS422, big_endian=True)
+def test_byte_order_reverses_the_bytes_of_each_number():
+    (message,) = RS422.messages
+    reversed_fields = tuple(field._replace(big_endian=True) for field in message.fields)
+    turned = replace(RS422, messages=(message._replace(fields=reversed_fields),))
     (little,) = StreamEncoder(RS422).encode(samples())
     (big,) = StreamEncoder(turned).encode(samples())
     for field in RS422.messages[0].fields:

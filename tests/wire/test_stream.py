@@ -103,19 +103,41 @@ def test_a_frame_carries_the_time_of_the_bytes_that_completed_it():
     assert decoder.feed(WORKED[1:], 3).frames["t_ns"].tolist() == [3]
 
 
-def test_a_frame_tells_how_many_frames_worth_of_bytes_were_rejected_before_it():
+def test_reads_at_once_have_the_time_of_the_read_that_completed_each_frame():
+    decoder = StreamDecoder(RS422)
+    data = np.frombuffer(b"\x00" + WORKED * 3 + WORKED[:10], np.uint8)
+    ends, times = np.array([20, 44, 44, 45, 133, 143]), np.array([1, 2, 3, 4, 5, 6])
+    assert decoder.feed_reads(data, ends, times).frames["t_ns"].tolist() == [4, 5, 5]
+    more = np.frombuffer(WORKED[10:], np.uint8)
+    assert decoder.feed_reads(more, np.array([34]), np.array([7])).frames["t_ns"].tolist() == [7]
+
+
+def test_reads_whose_ends_are_not_those_of_the_data_are_refused():
+    with pytest.raises(ValueError, match="the last end 44"):
+        StreamDecoder(RS422).feed_reads(np.frombuffer(WORKED, np.uint8), np.array([43]), np.array([1]))
+
+
+def test_more_rejects_than_fit_in_one_scan_end_a_read_at_its_end_too():
+    data = np.frombuffer(DAMAGED * 3000 + WORKED, np.uint8)
+    ends = np.arange(1, 3002) * LENGTH
+    found = StreamDecoder(RS422).feed_reads(data, ends, ends)
+    assert found.rejects["offset"].tolist() == list(range(0, 3000 * LENGTH, LENGTH))
+    assert found.frames["t_ns"].tolist() == [3001 * LENGTH]
+
+
+def test_a_frame_has_the_number_of_frame_lengths_rejected_before_it():
     data = WORKED + DAMAGED + DAMAGED[:30] + WORKED + WORKED + b"\x00" + WORKED
     assert decode(data).frames["damaged"].tolist() == [0, 2, 0, 1]
 
 
-def test_more_rejects_than_one_scan_has_room_for_all_come_out():
+def test_more_rejects_than_fit_in_one_scan_are_all_returned():
     found = decode(DAMAGED * 3000 + WORKED)
     assert found.rejects["offset"].tolist() == list(range(0, 3000 * LENGTH, LENGTH))
     assert found.frames["damaged"].tolist() == [3000]
 
 
 @pytest.mark.parametrize("axis", ["x", "y", "z"])
-def test_a_reference_capture_decodes_to_every_frame_and_its_account_closes(reference, axis):
+def test_a_reference_capture_decodes_to_every_frame_and_its_counts_add_up(reference, axis):
     data = (reference / f"{axis}_up.raw").read_bytes()
     found = decode(data)
     assert len(found.frames) == 74_500
@@ -129,19 +151,19 @@ def test_a_reference_capture_decodes_to_every_frame_and_its_account_closes(refer
     assert np.all(np.diff(pulses["elapsed_ns"]) == 1_000_000)
 
 
-def test_the_reference_capture_with_x_up_goes_across_the_counters_wrap(reference):
+def test_the_reference_capture_with_x_up_contains_a_wrap_of_the_counter(reference):
     counters = decode((reference / "x_up.raw").read_bytes()).frames["counter"]
     (wrap,) = np.flatnonzero(np.diff(counters) != 1)
     assert (counters[wrap], counters[wrap + 1]) == (2**32 - 1, 0)
 
 
 @pytest.mark.parametrize("axis", ["x", "y", "z"])
-def test_damage_costs_exactly_the_damaged_frames_in_any_chunks(reference, axis):
+def test_damage_loses_exactly_the_damaged_frames_in_any_chunks(reference, axis):
     raw = (reference / f"{axis}_up.raw").read_bytes()
     frames = np.frombuffer(raw, np.uint8).reshape(-1, LENGTH)
     kinds = StreamRates.model_fields
     line = StreamFaults(
-        Faults(stream=StreamRates(**dict.fromkeys(kinds, 0.02 / len(kinds)))), HEADER, seed=11
+        Faults(stream=StreamRates(**dict.fromkeys(kinds, 0.02 / len(kinds)))), [(LENGTH, HEADER)], seed=11
     )
     data, damage = line.apply(frames, np.arange(len(frames)))
     # The first and the last frame frame the account: what is lost outside of them no counter tells.

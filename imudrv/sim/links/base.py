@@ -125,6 +125,8 @@ class FileLine(SimulatedLine):
             except BlockingIOError:
                 continue
             except OSError as error:
+                if not self._has_reader():  # it has left since
+                    continue
                 raise InputError(f"the port went away: {error.strerror}") from error
         self.undelivered += len(rest)
 

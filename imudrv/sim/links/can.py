@@ -2,14 +2,14 @@
 
 import time
 from typing import Any
-from urllib.parse import SplitResult, parse_qsl
 
 import can
 
 from imudrv.errors import InputError
 from imudrv.profiles.schema import CanLine
-from imudrv.records import Records
+from imudrv.records import EXTENDED, Records
 from imudrv.sim.links.base import POLL_S, RETRY_S, TIMEOUT_S, LineOptions, SimulatedLine
+from imudrv.url import Url, value
 
 
 class SimulatedCanBus(SimulatedLine):
@@ -19,7 +19,7 @@ class SimulatedCanBus(SimulatedLine):
     ----------
     options : LineOptions
         Options of every line.
-    url : SplitResult
+    url : Url
         ``can://INTERFACE/CHANNEL?...``; the query holds options of python-can.
     line : CanLine
         Settings of the bus.
@@ -30,21 +30,22 @@ class SimulatedCanBus(SimulatedLine):
         The bus cannot be opened.
     """
 
-    def __init__(self, options: LineOptions, url: SplitResult, line: CanLine) -> None:
+    def __init__(self, options: LineOptions, url: Url, line: CanLine) -> None:
         super().__init__(options)
+        interface, _, channel = url.address.partition("/")
         settings: dict[str, Any] = {"bitrate": line.bitrate, "data_bitrate": line.data_bitrate}
-        settings |= {key: can.util.cast_from_string(value) for key, value in parse_qsl(url.query)}
+        settings |= {name: value(text) for name, text in url.options.items()}
         try:
             self._bus = can.Bus(
-                interface=url.netloc,
-                channel=url.path.removeprefix("/"),
+                interface=interface,
+                channel=channel,
                 ignore_config=True,
                 fd=line.data_bitrate is not None,
-                **{key: value for key, value in settings.items() if value is not None},
+                **{name: setting for name, setting in settings.items() if setting is not None},
             )
         except (can.CanError, NotImplementedError, OSError, TypeError, ValueError) as error:
-            raise InputError(f"{url.geturl()}: cannot be opened as a CAN bus: {error}") from error
-        self._say(f"{options.name} plays on {url.geturl()}")
+            raise InputError(f"{url.text}: cannot be opened as a CAN bus: {error}") from error
+        self._say(f"{options.name} plays on {url.text}")
 
     def send(self, data: bytes | Records) -> None:
         """Send messages."""
@@ -55,8 +56,8 @@ class SimulatedCanBus(SimulatedLine):
         heads = zip(data["id"].tolist(), data["length"].tolist(), data["fd"].tolist(), strict=True)
         for i, (identifier, length, fd) in enumerate(heads):
             message = can.Message(
-                arbitration_id=identifier,
-                is_extended_id=identifier > 0x7FF,
+                arbitration_id=identifier & ~EXTENDED,
+                is_extended_id=bool(identifier & EXTENDED),
                 is_fd=bool(fd),
                 bitrate_switch=bool(fd),
                 data=content[i * width : i * width + length],

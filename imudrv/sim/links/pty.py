@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from imudrv.errors import InputError
-from imudrv.sim.links.base import RETRY_S, TIMEOUT_S, FileLine, LineOptions
+from imudrv.sim.links.base import READ_BYTES, RETRY_S, TIMEOUT_S, FileLine, LineOptions
 
 SETTLE_S: Final = 0.25
 """Time that a reader has to flush and set up the port after opening it, s."""
@@ -80,33 +80,38 @@ class SimulatedPty(FileLine):
             return
         slave = os.open(self._path, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
         try:
-            unread, since, empty = _unread(slave), time.monotonic(), 0
-            # bytes between the two ends are not counted: the queue has to be empty several times in a row
+            unread, since, empty = queued_bytes(slave), time.monotonic(), 0
+            # A reader may empty the queue just before the rest is moved there: it is looked at several times.
             while empty < 5 and time.monotonic() - since < TIMEOUT_S:
                 time.sleep(RETRY_S)
-                before, unread = unread, _unread(slave)
+                before, unread = unread, queued_bytes(slave)
                 empty = empty + 1 if unread == 0 else 0
                 if unread != before:
                     since = time.monotonic()
+            left = 0
+            with suppress(BlockingIOError):  # at its end; the queue shows 4 KiB at the most
+                while piece := os.read(slave, READ_BYTES):
+                    left += len(piece)
         finally:
             os.close(slave)
-        self.sent -= unread
-        self.undelivered += unread
+        self.sent -= left
+        self.undelivered += left
 
     def close(self) -> None:
-        """Close the pty and remove the link."""
+        """Remove the link and close the pty, in this order: no reader finds a closed pty."""
         if self._fd < 0:
             return
-        os.close(self._fd)
-        self._fd = -1
         if self._link is not None and self._link.is_symlink():
             with suppress(OSError):
                 if os.readlink(self._link) == self._path:
                     self._link.unlink()
+        os.close(self._fd)
+        self._fd = -1
 
 
-def _unread(fd: int) -> int:
-    """Return the number of bytes in a terminal's input queue."""
+def queued_bytes(fd: int) -> int:
+    """Return the number of bytes in a terminal's input queue; not 0 while some are on their way there."""
+    ready, _, _ = select.select([fd], [], [], 0)  # moves what was written but not handed over to the queue
     count = array.array("i", [0])
     fcntl.ioctl(fd, termios.FIONREAD, count)
-    return count[0]
+    return count[0] or len(ready)

@@ -2,11 +2,11 @@
 
 import time
 from contextlib import suppress
+from typing import Any
 
 import serial
 
 from imudrv.errors import InputError
-from imudrv.profiles.schema import SerialLine
 from imudrv.sim.links.base import RETRY_S, TIMEOUT_S, FileLine, LineOptions
 
 
@@ -19,8 +19,8 @@ class SimulatedSerialPort(FileLine):
         Options of every line.
     path : str
         Path of the device.
-    line : SerialLine
-        Settings of the port.
+    settings : dict
+        Settings of the line for pyserial.
 
     Raises
     ------
@@ -28,26 +28,18 @@ class SimulatedSerialPort(FileLine):
         The port cannot be opened.
     """
 
-    def __init__(self, options: LineOptions, path: str, line: SerialLine) -> None:
+    def __init__(self, options: LineOptions, path: str, settings: dict[str, Any]) -> None:
         super().__init__(options)
         self._path = path
-        self._line = line
+        self._settings = settings
         self._port: serial.Serial | None = None
         self.plug()
-        self._say(f"{options.name}, {line.baudrate} baud, plays on {path}")
+        self._say(f"{options.name}, {settings['baudrate']} baud, plays on {path}")
 
     def plug(self) -> None:
         """Open the port."""
-        line = self._line
         try:
-            self._port = serial.Serial(
-                self._path,
-                baudrate=line.baudrate,
-                bytesize=line.bytesize,
-                parity=line.parity[0].upper(),
-                stopbits=line.stopbits,
-                exclusive=True,
-            )
+            self._port = serial.Serial(self._path, **self._settings, exclusive=True)
         except (OSError, ValueError) as error:
             raise InputError(f"{self._path}: cannot be opened as a serial port: {error}") from error
         self._fd = self._port.fileno()

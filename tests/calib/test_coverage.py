@@ -1,11 +1,11 @@
-"""Coverage of the evidence by the recordings."""
+"""Coverage of the attempts by their recordings."""
 
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from calib.bench.evidence import require_covered, uncovered
+from calib.bench.result import decode_covered, uncovered
 from calib.bench.state import Attempt
 from calib.procedure.schema import Step
 from imudrv import profiles
@@ -45,12 +45,12 @@ def test_what_the_recording_does_not_cover_is_named(
     words = f"its recording does not cover counters {gap}" if gap else ""
     assert uncovered(attempt(path, samples)) == words
     if not gap:
-        require_covered(attempt(path, samples))
+        decode_covered(attempt(path, samples))
         return
     with pytest.raises(
         InputError, match=rf"step z-up: {words}; .*calib run --session {tmp_path} --redo z-up"
     ):
-        require_covered(attempt(path, samples))
+        decode_covered(attempt(path, samples))
 
 
 def test_samples_lost_on_the_line_are_not_missing_from_the_recording(
@@ -74,7 +74,7 @@ def test_a_narrow_counter_wraps_before_and_within_the_recording(
     (tmp_path / "narrow.yaml").write_text(text)
     begin = rounds * (1 << 16) + 65_000
     path = recorded(tmp_path / "run.mcap", range(begin, begin + 150_000), str(tmp_path / "narrow.yaml"))
-    # The recording goes on for more than a round after the evidence: nobody was there to end it.
+    # The recording goes on for more than a round after the attempt: nobody was there to end it.
     first, last = begin + 500, begin + 70_000
     assert uncovered(Attempt(STEP, path, first, last, last - first + 1)) == ""
     assert uncovered(Attempt(STEP, path, begin - 50, last)) == (
@@ -82,7 +82,7 @@ def test_a_narrow_counter_wraps_before_and_within_the_recording(
     )
 
 
-def test_samples_before_a_restart_of_the_unit_are_no_evidence(recorded: Recorded, tmp_path: Path) -> None:
+def test_samples_before_a_restart_of_the_unit_are_not_used(recorded: Recorded, tmp_path: Path) -> None:
     path = recorded(tmp_path / "run.mcap", [*range(1000, 3000), *range(1900, 5500)])
     assert uncovered(attempt(path)) == ""
     late = recorded(tmp_path / "late.mcap", [*range(1000, 5500), *range(2100, 5500)])

@@ -1,7 +1,7 @@
 """Messages to the operator: keys with values; a catalogue for each language has the sentences.
 
 A catalogue is a YAML file with one line for each key; its text is a Python format string with the values of
-the message. Text from elsewhere (detection, estimation, service, recordings) is the message `verbatim`.
+the message. Text of `imudrv` (alignment, service, recordings) is the message `verbatim`.
 """
 
 from collections.abc import Mapping

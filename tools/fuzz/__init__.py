@@ -1,0 +1,1 @@
+"""Fuzzing of decoders, settings files and the processing chain: `python -m tools.fuzz`."""

@@ -1,0 +1,1 @@
+"""Endurance tests of the live service: `python -m tools.soak`."""

@@ -1,0 +1,65 @@
+"""Every sample from the process of the unit through that of the service into a third one."""
+
+import os
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from imudrv.recording.reader import Recording
+from imudrv.records import Records
+
+from .checks import TIMEOUT_S, Check, measured
+from .data import SERIAL, difference, last_status, write_scenario
+from .processes import Stage, free_port, run_ok
+from .usage import UsageMonitor, memory_checks
+
+CPU_PERCENT: Final = 15.0
+
+
+def loopback(folder: Path, seconds: float, profile: str = SERIAL, speed: float = 1.0) -> list[Check]:
+    """Play a unit for some seconds at `speed` kHz and compare what arrives with the offline command."""
+    samples = write_scenario(folder, seconds * speed)
+    out = f"udp://127.0.0.1:{free_port()}"
+    load = os.getloadavg()[0]
+    with Stage(folder) as stage:
+        listener = stage.listener(out, "received.npy")
+        unit, service = stage.unit_and_service(profile, f"{speed:g}", "--out", out, "--record", "run.mcap")
+        monitor = UsageMonitor(service.process.pid)
+        unit.wait(TIMEOUT_S + 2.0 * seconds)
+        usage = monitor.stop()
+        load = max(load, os.getloadavg()[0])
+        service.await_port("lost", "silent")  # all that was sent has been read
+        code = service.stop()
+        listener.stop()
+    received: Records = np.load(folder / "received.npy")
+    counts, status = last_status(Recording(folder / "run.mcap"))
+    report = run_ok("compensate", folder / "run.mcap", "-o", folder / "offline.npz")
+    differs = difference(received, folder / "offline.npz")
+    percent = 100.0 * (usage[-1].cpu_s - usage[0].cpu_s) / seconds
+    limit = CPU_PERCENT if speed == 1.0 else 100.0
+    latency = (status["latency"][name] * 1e3 for name in ("p50_s", "p99_s", "p999_s", "max_s"))
+    return [
+        Check(
+            f"all {samples:,} samples arrive, in order",
+            f"{len(received):,} received; {listener.line_with('lost')}",
+            np.array_equal(received["counter"], np.arange(samples)),
+        ),
+        Check("the service ends with exit code 0", f"exit code {code}", code == 0),
+        Check("the counts add up", str(counts), counts.closes and counts.good == samples),
+        Check(
+            "bit-identical to `imudrv compensate` of the recording",
+            differs or f"{len(received):,} rows, all columns with times and flags",
+            not differs and f"  {counts}" in report,
+        ),
+        measured("the unit", unit.lines[-1].strip()),
+        measured(
+            f"CPU <= {limit:g} % of a core",
+            f"{percent:.1f} %; system load {load:.1f} on {os.cpu_count()} cores",
+            percent <= limit,
+        ),
+        measured(
+            "latency from read to socket, p50 p99 p99.9 max", " ".join(f"{x:.2f}" for x in latency) + " ms"
+        ),
+        *memory_checks(usage, 10.0),
+    ]
