@@ -10,7 +10,7 @@ import numpy as np
 
 from imudrv.kernels import kernel
 from imudrv.records import FRAME, MAX_TEMPERATURES, REJECT, Reason, Records
-from imudrv.wire.fields import SLACK, Bytes, ahead_of, checks_hold, fill, hold, number
+from imudrv.wire.fields import SLACK, Bytes, ahead_of, checks_hold, fill, hold, number, plain_check_holds
 from imudrv.wire.layout import MAX_MESSAGES, NARROW_BITS, Layout, SequenceKind
 from imudrv.wire.stream import Decoded
 from imudrv.wire.tables import Tables, layout_tables
@@ -34,6 +34,7 @@ CONSTANTS: Final = np.dtype(
         ("is_ordered", np.bool_),  # the messages of a sample belong together by their order
         ("longest_ns", np.int64),  # from the first message of a sample to its last one
         ("inverted", np.uint32),  # status before any was received: no bit applies
+        ("is_plain", np.bool_),  # the identifier alone tells the kind, and a plain check is all there is
     ],
     align=True,
 )
@@ -74,6 +75,7 @@ STATE: Final = np.dtype(
 """State that a call of the kernels leaves to the next."""
 
 _SOURCE: Final = 0xFF
+_WHOLE_ID: Final = 0xFFFFFFFF
 _NO_FRAMES: Final = np.zeros(0, FRAME)
 _NO_REJECTS: Final = np.zeros(0, REJECT)
 _SOUND: Final = 0
@@ -201,6 +203,10 @@ def _constants(layout: Layout, kinds: Records) -> Records:
     period = 1 if constants["is_ordered"][0] else (1 << int(low_bits)) / layout.sequence.step
     constants["longest_ns"] = min(int(period * layout.interval / 2), _EVER_NS)
     constants["inverted"] = layout.status.inverted
+    constants["is_plain"] = all(
+        m.can_mask == _WHOLE_ID and not m.constants and m.checks in ((), (m.plain_check,))
+        for m in layout.messages
+    )
     return constants
 
 
@@ -229,12 +235,19 @@ def _assemble(
     data = np.zeros(_ROOM, np.uint8)
     for i in range(messages.shape[0]):
         message = messages[np.uint64(i)]
-        k = _kind_of(message, kinds, fixed_bytes, s)
+        k = (
+            _plain_kind_of(message["id"], kinds)
+            if c["is_plain"]
+            else _kind_of(message, kinds, fixed_bytes, s)
+        )
         if k < 0:
             s["foreign"] += 1
         else:
             kind = kinds[np.uint64(k)]
-            fault = _fault(message, data, kind, fixed_bytes, checks)
+            if c["is_plain"]:
+                fault = _plain_fault(message, data, kind)
+            else:
+                fault = _fault(message, data, kind, fixed_bytes, checks)
             if fault != _SOUND:
                 s["damaged"] += 1
                 _reject(s["index"], fault, s, rejects)
@@ -277,6 +290,24 @@ def _kind_of(message: np.void, kinds: Records, fixed_bytes: Records, s: np.void)
         if best < 0:
             best = k
     return best
+
+
+@kernel
+def _plain_kind_of(identifier: int, kinds: Records) -> int:
+    """Return the row of the kind with this identifier; -1 for an unknown one. Faster than `_kind_of`."""
+    for k in range(kinds.shape[0]):
+        if kinds[np.uint64(k)]["can_id"] == identifier:
+            return k
+    return -1
+
+
+@kernel
+def _plain_fault(message: np.void, data: Bytes, kind: np.void) -> int:
+    """Do what `_fault` does, without constants and with a plain check at most."""
+    if message["length"] != kind["length"]:
+        return _WRONG_LENGTH
+    _copy(message["data"], data, kind["length"])
+    return _SOUND if plain_check_holds(data, 0, kind) else _CHECK_FAILED
 
 
 @kernel

@@ -104,6 +104,8 @@ class CandumpDecoder:
         InputError
             The message names the channels of the log so far.
         """
+        if not self._is_closed and np.count_nonzero(self._counts) < 2:
+            return
         names = sorted(self.channels)
         came = " and ".join(", ".join(names).rsplit(", ", 1))
         if self._channel is None and len(names) > 1:
