@@ -9,8 +9,8 @@ import pytest
 from realtime import DEADLINE_S
 
 from imudrv.calibration import coefficients, write_calibration
+from imudrv.chain import Chain
 from imudrv.errors import InputError
-from imudrv.pipeline import Pipeline
 from imudrv.recording.reader import Recording
 from imudrv.records import Flag, Records
 from imudrv.service.loop import Service
@@ -84,9 +84,9 @@ def test_one_recording_follows_another_between_two_reads_and_nothing_is_lost_bet
 
 def replayed(recording: Recording) -> Records:
     """Increments that the wire of a recording gives."""
-    pipeline = Pipeline(recording.profile, coefficients(NOMINAL), "causal")
-    increments = [pipeline.feed(arrival.data, arrival.t_ns).increments for arrival in recording.arrivals()]
-    return np.concatenate([*increments, pipeline.close().increments])
+    chain = Chain(recording.profile, coefficients(NOMINAL), "causal")
+    increments = [chain.feed(arrival.data, arrival.t_ns).increments for arrival in recording.arrivals()]
+    return np.concatenate([*increments, chain.close().increments])
 
 
 @pytest.mark.parametrize("keeps", [True, False])

@@ -20,11 +20,11 @@ import numpy as np
 
 from imudrv import profiles
 from imudrv.calibration import coefficients
+from imudrv.chain import Chain, Output
 from imudrv.diagnosis import LineState
 from imudrv.hostclock import now_ns
-from imudrv.pipeline import Pipeline, PipelineOutput
 from imudrv.ports import PortEndedError
-from imudrv.records import INCREMENTS, PULSES, Arrival, Flag, Source
+from imudrv.records import INCREMENTS, PULSES, Arrival, Source
 from imudrv.service.calibration_watch import CalibrationWatch
 from imudrv.service.clock_watch import ClockWatch
 from imudrv.service.events import EventLog
@@ -48,11 +48,9 @@ from imudrv.sinks.base import Batch, Sink
 from imudrv.sinks.history import History
 from imudrv.sinks.recorder import Recorder
 from imudrv.units import NS, NS_PER_S
-from imudrv.wire.datagram import encode
 
 POLL_NS: Final = NS_PER_S // 50
 """Time between two rounds of housekeeping, and the longest wait for data."""
-_INVALID: Final = np.uint32(~Flag.VALID & 0xFFFF_FFFF)
 
 
 class Service:
@@ -114,10 +112,11 @@ class Service:
             Path(settings.calibration), settings.unit, self._layout, self._events
         )
         self._port = PortSupervisor(settings.port, self._profile, in_real_time, self._events, clock)
-        self._pipeline = Pipeline(
+        self._chain = Chain(
             self._profile,
             coefficients(self._calibration.current.model),
             settings.rate_filter,
+            self._port.source,
         )
         self._latency = Latency(self._layout.interval_ns)
         self._signals = signals or SignalFlags()
@@ -194,9 +193,9 @@ class Service:
 
     def close(self) -> None:
         """Publish the samples that are held back, and close everything; `run` does it."""
-        self._publish(self._pipeline.close(), self._clock())
+        self._publish(self._chain.close(), self._clock())
         self._port.close()
-        self._events.event(f"end: {self._pipeline.tracker.counts}")
+        self._events.event(f"end: {self._chain.tracker.counts}")
         self._publish_status(self._clock())
         self._recordings.close()
         self._open.close()
@@ -240,18 +239,16 @@ class Service:
         if not self._in_real_time:
             arrival = arrival._replace(t_ns=0)  # when it came tells nothing about its samples
         self._recordings.arrived(arrival)
-        self._pipeline.clock.follow(arrival.timebase)
-        output = self._pipeline.feed(arrival.data, arrival.t_ns)
+        self._chain.clock.follow(arrival.timebase)
+        output = self._chain.feed(arrival.data, arrival.t_ns)
         self._publish(output, read_ns)
         self._port.decoded(arrival, len(output.pulses))
 
-    def _publish(self, output: PipelineOutput, arrival_ns: int) -> None:
-        pulses, increments = output
+    def _publish(self, output: Output, arrival_ns: int) -> None:
+        pulses, increments, datagrams = output
         if not len(pulses) and not len(increments):
             return
-        if self._port.state.name == "wrong rate":
-            increments["flags"] &= _INVALID  # they do not cover the interval that they name
-        batch = Batch(pulses, increments, encode(increments, self._port.source))
+        batch = Batch(pulses, increments, datagrams)
         for sink in self._sinks:
             sink.publish(batch)
         if len(pulses):
@@ -268,6 +265,8 @@ class Service:
             sink.poll()
         self._recordings.poll()
         self._port.check_line(now)
+        # At a wrong rate they do not cover the interval that they name.
+        self._chain.allow_valid(self._port.state.name != "wrong rate")
         self._manager.feed_watchdog(now)
         if self._events.is_new or now - self._rated_ns >= NS_PER_S:
             self._check_calibration(now)
@@ -278,7 +277,7 @@ class Service:
         if reload := self._signals.reload:
             self._signals.reload = False  # before the file is read: a later signal has it read again
         if (new := self._calibration.poll(reload)) is not None:
-            self._pipeline.replace_calibration(coefficients(new.model))
+            self._chain.replace_calibration(coefficients(new.model))
             self._recordings.calibration(now, new.content)
             self._events.event(f"calibration replaced: {new.sha256[:12]}")
 
@@ -293,14 +292,14 @@ class Service:
         self._recordings.status(document)
 
     def _measure_rate(self, now: int) -> None:
-        counts = self._pipeline.tracker.counts
+        counts = self._chain.tracker.counts
         self._rate_hz = (self._samples - self._rated_samples) / ((now - self._rated_ns) * NS)
         self._lost_last_s = counts.lost - self._rated_lost
         self._rated_samples, self._rated_lost, self._rated_ns = self._samples, counts.lost, now
         self._port.check_rate(counts.expected, self._lost_last_s, now)
 
     def _assemble_status(self, now: int) -> Status:
-        calibration, pipeline = self._calibration, self._pipeline
+        calibration, chain = self._calibration, self._chain
         pulses = self._last_pulses[-1]
         return Status(
             software=self._version,
@@ -313,12 +312,12 @@ class Service:
             calibration=calibration.status,
             rate_hz=self._rate_hz,
             nominal_rate_hz=self._profile.rate_hz,
-            samples=SampleStatus(**vars(pipeline.tracker.counts), lost_last_s=self._lost_last_s),
+            samples=SampleStatus(**vars(chain.tracker.counts), lost_last_s=self._lost_last_s),
             rejected={
                 reason.name.lower(): RejectedStatus(entry.runs, entry.length)
-                for reason, entry in sorted(pipeline.decoder.rejected.items())
+                for reason, entry in sorted(chain.decoder.rejected.items())
             },
-            clock=pipeline.clock.report,
+            clock=chain.clock.report,
             latency=self._latency.report,
             temperature_degc=temperatures(pulses, self._layout),
             unit_status=UnitStatus.of(int(pulses["status"]), self._layout),

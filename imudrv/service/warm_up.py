@@ -5,11 +5,10 @@ from typing import Final
 import numpy as np
 
 from imudrv.calibration import Calibration, coefficients
+from imudrv.chain import Chain
 from imudrv.imu.rate_filter import RateFilterName
-from imudrv.pipeline import Pipeline
 from imudrv.profiles.schema import Profile
-from imudrv.records import PULSES, Source
-from imudrv.wire.datagram import encode
+from imudrv.records import PULSES
 from imudrv.wire.encode import CanEncoder, StreamEncoder
 
 _SAMPLES: Final = 300
@@ -23,12 +22,11 @@ def warm_up(profile: Profile, calibration: Calibration, rate_filter: RateFilterN
     pulses = np.zeros(_SAMPLES, PULSES)
     pulses["counter"] = layout.counter_step * np.arange(_SAMPLES)
     pulses["temperature_degc"] = 35.0
-    pipeline = Pipeline(profile, coefficients(calibration), rate_filter)
+    chain = Chain(profile, coefficients(calibration), rate_filter)
     wire = CanEncoder(layout).encode(pulses) if layout.can else StreamEncoder(layout).encode(pulses).tobytes()
     piece = max(1, len(wire) // _PIECES)
     for at in range(0, len(wire), piece):
-        increments = pipeline.feed(wire[at : at + piece], at).increments
-        encode(increments, Source.SIMULATOR)
-    pipeline.replace_calibration(coefficients(calibration))
-    pipeline.feed(wire, len(wire))
-    pipeline.close()
+        chain.feed(wire[at : at + piece], at)
+    chain.replace_calibration(coefficients(calibration))
+    chain.feed(wire, len(wire))
+    chain.close()
