@@ -84,6 +84,11 @@ class Port(ABC):
             There are no more data.
         """
 
+    @property
+    def descriptor(self) -> int | None:
+        """Descriptor from which each read gives wire bytes, without blocking; None if there is none."""
+        return None
+
     def line_errors(self) -> LineErrors:
         """Return the errors that the driver has counted; zeros where it does not count."""
         return LineErrors()

@@ -149,6 +149,11 @@ class DescriptorPort(Port):
             raise PortLostError(f"{self.url}: the other end has gone")
         return Arrival(t_ns, data)
 
+    @property
+    def descriptor(self) -> int | None:
+        """See `Port.descriptor`."""
+        return None if self._closed else self._fd
+
     def line_errors(self) -> LineErrors:
         """See `Port.line_errors`."""
         if self._closed:

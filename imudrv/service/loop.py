@@ -3,6 +3,9 @@
 One thread reads, stamps, decodes, compensates and publishes, driven by samples and not by a timer. What the
 system has held back arrives as one batch and is processed as one. Everything else is done between two reads,
 fifty times a second, in microseconds.
+
+A port with a descriptor is served by a kernel (`imudrv.service.serve`), which returns for all that is not a
+read, its samples and their datagrams. Other ports are read by Python. Both use the kernels of `imudrv.chain`.
 """
 
 import json
@@ -11,14 +14,16 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack
 from datetime import UTC, datetime
+from functools import cache
 from importlib.metadata import version
+from itertools import islice
 from pathlib import Path
 from signal import SIGHUP, SIGINT, SIGTERM
 from typing import Final
 
 import numpy as np
 
-from imudrv import profiles
+from imudrv import profiles, system
 from imudrv.calibration import coefficients
 from imudrv.chain import Chain, Output
 from imudrv.diagnosis import LineState
@@ -28,10 +33,11 @@ from imudrv.records import INCREMENTS, PULSES, Arrival, Source
 from imudrv.service.calibration_watch import CalibrationWatch
 from imudrv.service.clock_watch import ClockWatch
 from imudrv.service.events import EventLog
-from imudrv.service.latency import Latency
+from imudrv.service.latency import Latency, count_latency
 from imudrv.service.port import PortSupervisor
 from imudrv.service.recordings import Recordings
 from imudrv.service.runtime import SignalFlags, SystemdNotifier, ask_realtime, frozen_gc
+from imudrv.service.serve import DescriptorLoop, Served, Why
 from imudrv.service.settings import Settings
 from imudrv.service.status import (
     IncrementStatus,
@@ -119,6 +125,8 @@ class Service:
             self._port.source,
         )
         self._latency = Latency(self._layout.interval_ns)
+        is_direct = system.IS_AVAILABLE and clock is now_ns and clock_watch is None and not self._layout.can
+        self._descriptor_loop = DescriptorLoop(self._chain, self._latency) if is_direct else None
         self._signals = signals or SignalFlags()
         self._manager = SystemdNotifier()
         self._notices: list[str] = []
@@ -137,22 +145,22 @@ class Service:
                 sink = open_sink(url, self._layout)
                 undo.callback(sink.close)
                 self._sinks.append(sink)
-            self._status_server = StatusServer(
-                Path(settings.status) if settings.status else default_status_path()
-            )
-            undo.callback(self._status_server.close)
+            status_path = Path(settings.status) if settings.status else default_status_path()
+            status_server = StatusServer(status_path, self._status_line)
+            undo.callback(status_server.close)
             if settings.record:
                 self._recordings.begin(Path(settings.record))
             self._open = undo.pop_all()
-        self._status = self._assemble_status(self._started_ns)
-        self._status_line = b""
+        self._latest = self._snapshot(self._started_ns)
+        status_server.start()
 
     def run(self) -> None:
         """Serve until SIGTERM, Ctrl-C, or the end of a replay."""
         if self._settings.realtime and (refusal := ask_realtime()):
             self._notices.append(refusal)
             self._events.failure(refusal)
-        warm_up(self._profile, self._calibration.current.model, self._settings.rate_filter)
+        is_direct = self._descriptor_loop is not None and self._port.source is Source.HARDWARE
+        warm_up(self._profile, self._calibration.current.model, self._settings.rate_filter, is_direct)
         with self._signals.caught(SIGTERM, SIGINT, SIGHUP), frozen_gc():
             try:
                 self._publish_status(self._clock())
@@ -174,10 +182,12 @@ class Service:
             False once a replay or a simulation is complete.
         """
         self._recordings.switch()
-        try:
-            arrival = self._port.read(POLL_NS * NS)
-        except PortEndedError:
-            return False
+        arrival = None
+        if not self._serve():
+            try:
+                arrival = self._port.read(POLL_NS * NS)
+            except PortEndedError:
+                return False
         if step := self._clock_watch.poll():
             self._events.offset_ns = self._clock_watch.timebase.offset_ns
             self._events.event(step)
@@ -212,7 +222,7 @@ class Service:
     @property
     def status(self) -> Status:
         """Status as last published; for any thread."""
-        return self._status
+        return self._latest()
 
     def record(self, path: Path | None, since: int | None = None) -> Future[None]:
         """Record into another file, or stop recording; for any thread.
@@ -234,6 +244,39 @@ class Service:
         """
         return self._recordings.request(path, since)
 
+    def _serve(self) -> bool:
+        """Let the kernel serve the port, if it can; return whether Python need not read it now."""
+        descriptor = self._port.descriptor
+        if self._descriptor_loop is None or descriptor is None or self._chain.is_exchanging:
+            return False
+        clocks = self._clock_watch
+        self._chain.clock.follow(clocks.timebase)
+        outlets = [sink.outlets() for sink in self._sinks]
+        served = self._descriptor_loop.run(
+            descriptor,
+            self._next_poll_ns,
+            clocks,
+            [outlet for some in outlets for outlet in some],
+            not all(sink.is_patient for sink in self._sinks),
+        )
+        if len(served.reads):
+            self._take(served, [len(some) for some in outlets])
+        return served.why not in (Why.CLOCKS, Why.GONE)
+
+    def _take(self, served: Served, outlets: Sequence[int]) -> None:
+        """Publish and record what the kernel has read; `outlets`: their number, for each sink."""
+        batch = Batch(*served.output)
+        if len(batch.pulses) or len(batch.increments):
+            written = iter(served.written)
+            for sink, count in zip(self._sinks, outlets, strict=True):
+                sink.written(batch, list(islice(written, count)))
+            self._count(batch)
+        if self._recordings.are_on:
+            for arrival, part in served.arrivals(self._clock_watch.timebase):
+                self._recordings.arrived(arrival)
+                self._recordings.publish(part)
+        self._port.decoded(served.data, len(batch.pulses))
+
     def _process(self, arrival: Arrival) -> None:
         read_ns = arrival.t_ns
         if not self._in_real_time:
@@ -242,23 +285,25 @@ class Service:
         self._chain.clock.follow(arrival.timebase)
         output = self._chain.feed(arrival.data, arrival.t_ns)
         self._publish(output, read_ns)
-        self._port.decoded(arrival, len(output.pulses))
+        self._port.decoded(arrival.data, len(output.pulses))
 
     def _publish(self, output: Output, arrival_ns: int) -> None:
-        pulses, increments, datagrams = output
-        if not len(pulses) and not len(increments):
+        batch = Batch(*output)
+        if not len(batch.pulses) and not len(batch.increments):
             return
-        batch = Batch(pulses, increments, datagrams)
         for sink in self._sinks:
             sink.publish(batch)
-        if len(pulses):
-            self._samples += len(pulses)
-            self._last_pulses = pulses
-        if len(increments):
-            self._last_increments = increments
-            if self._port.source is not Source.REPLAY:
-                self._latency.add(self._clock() - arrival_ns, len(increments))
+        if len(batch.increments) and self._port.source is not Source.REPLAY:
+            count_latency(self._clock() - arrival_ns, len(batch.increments), self._latency.state)
+        self._count(batch)
         self._recordings.publish(batch)
+
+    def _count(self, batch: Batch) -> None:
+        if len(batch.pulses):
+            self._samples += len(batch.pulses)
+            self._last_pulses = batch.pulses
+        if len(batch.increments):
+            self._last_increments = batch.increments
 
     def _poll(self, now: int) -> None:
         for sink in self._sinks:
@@ -271,7 +316,6 @@ class Service:
         if self._events.is_new or now - self._rated_ns >= NS_PER_S:
             self._check_calibration(now)
             self._publish_status(now)
-        self._status_server.poll(self._status_line)
 
     def _check_calibration(self, now: int) -> None:
         if reload := self._signals.reload:
@@ -286,10 +330,11 @@ class Service:
         self._events.is_new = False
         if now - self._rated_ns >= NS_PER_S:
             self._measure_rate(now)
-        self._status = self._assemble_status(now)
-        document = self._status.to_json()
-        self._status_line = json.dumps(document).encode() + b"\n"
-        self._recordings.status(document)
+        self._latest = latest = self._snapshot(now)
+        self._recordings.status(lambda: latest().to_json())
+
+    def _status_line(self) -> bytes:
+        return json.dumps(self._latest().to_json()).encode() + b"\n"
 
     def _measure_rate(self, now: int) -> None:
         counts = self._chain.tracker.counts
@@ -298,39 +343,50 @@ class Service:
         self._rated_samples, self._rated_lost, self._rated_ns = self._samples, counts.lost, now
         self._port.check_rate(counts.expected, self._lost_last_s, now)
 
-    def _assemble_status(self, now: int) -> Status:
+    def _snapshot(self, now: int) -> Callable[[], Status]:
+        """Note the present state; return what makes the status of it, in any thread."""
         calibration, chain = self._calibration, self._chain
-        pulses = self._last_pulses[-1]
-        return Status(
-            software=self._version,
-            pid=os.getpid(),
-            t_ns=now + self._clock_watch.timebase.offset_ns,
-            uptime_s=(now - self._started_ns) * NS,
-            port=self._port.status,
-            profile=self._profile.name,
-            unit=calibration.current.model.serial_number,
-            calibration=calibration.status,
-            rate_hz=self._rate_hz,
-            nominal_rate_hz=self._profile.rate_hz,
-            samples=SampleStatus(**vars(chain.tracker.counts), lost_last_s=self._lost_last_s),
-            rejected={
-                reason.name.lower(): RejectedStatus(entry.runs, entry.length)
-                for reason, entry in sorted(chain.decoder.rejected.items())
-            },
-            clock=chain.clock.report,
-            latency=self._latency.report,
-            temperature_degc=temperatures(pulses, self._layout),
-            unit_status=UnitStatus.of(int(pulses["status"]), self._layout),
-            sinks=[sink.state for sink in self._sinks],
-            recording=self._recordings.state,
-            last=IncrementStatus.of(self._last_increments[-1]),
-            notices=[
-                *self._notices,
-                *([calibration.refused] if calibration.refused else []),
-                *self._more_notices(),
-            ],
-            events=self._events.lines,
-        )
+        pulses, increments = self._last_pulses[-1], self._last_increments[-1]
+        status_word, latency, counts = int(pulses["status"]), self._latency.copy(), chain.tracker.counts
+        started_ns, rate_hz, lost_last_s = self._started_ns, self._rate_hz, self._lost_last_s
+        t_ns, unit = now + self._clock_watch.timebase.offset_ns, calibration.current.model.serial_number
+        port, calibration_status = self._port.status, calibration.status
+        refused = [calibration.refused] if calibration.refused else []
+        rejected = [(reason, entry.runs, entry.length) for reason, entry in chain.decoder.rejected.items()]
+        clock, recording, events = chain.clock.report, self._recordings.state, self._events.lines
+        sinks = [sink.state for sink in self._sinks]
+        notices = [*self._notices, *refused, *self._more_notices()]
+
+        @cache
+        def status() -> Status:
+            return Status(
+                software=self._version,
+                pid=os.getpid(),
+                t_ns=t_ns,
+                uptime_s=(now - started_ns) * NS,
+                port=port,
+                profile=self._profile.name,
+                unit=unit,
+                calibration=calibration_status,
+                rate_hz=rate_hz,
+                nominal_rate_hz=self._profile.rate_hz,
+                samples=SampleStatus(**vars(counts), lost_last_s=lost_last_s),
+                rejected={
+                    reason.name.lower(): RejectedStatus(runs, length)
+                    for reason, runs, length in sorted(rejected)
+                },
+                clock=clock,
+                latency=latency.report,
+                temperature_degc=temperatures(pulses, self._layout),
+                unit_status=UnitStatus.of(status_word, self._layout),
+                sinks=sinks,
+                recording=recording,
+                last=IncrementStatus.of(increments),
+                notices=notices,
+                events=events,
+            )
+
+        return status
 
     def _create_recorder(self, path: Path) -> Recorder:
         if path.is_dir():

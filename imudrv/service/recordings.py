@@ -67,6 +67,11 @@ class Recordings:
         Thread(target=close, name="close recording", daemon=True).start()
 
     @property
+    def are_on(self) -> bool:
+        """Whether arrivals and batches are of use."""
+        return self._recorder is not None or self._history is not None
+
+    @property
     def state(self) -> SinkState | None:
         """State of the current recording; None if there is none."""
         return self._recorder.state if self._recorder is not None else None
@@ -97,8 +102,8 @@ class Recordings:
         if self._recorder is not None:
             self._recorder.event(t_ns, text)
 
-    def status(self, document: Mapping[str, object]) -> None:
-        """Record the status as JSON."""
+    def status(self, document: Callable[[], Mapping[str, object]]) -> None:
+        """Record the status, which is made in the writing thread."""
         if self._recorder is not None:
             self._recorder.status(document)
 

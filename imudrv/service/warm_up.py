@@ -9,6 +9,9 @@ from imudrv.chain import Chain
 from imudrv.imu.rate_filter import RateFilterName
 from imudrv.profiles.schema import Profile
 from imudrv.records import PULSES
+from imudrv.service.clock_watch import ClockWatch
+from imudrv.service.latency import Latency
+from imudrv.service.serve import DescriptorLoop
 from imudrv.wire.encode import CanEncoder, StreamEncoder
 
 _SAMPLES: Final = 300
@@ -16,8 +19,16 @@ _SAMPLES: Final = 300
 _PIECES: Final = 50
 
 
-def warm_up(profile: Profile, calibration: Calibration, rate_filter: RateFilterName) -> None:
-    """Send made-up samples through every stage, including a replacement of the calibration."""
+def warm_up(profile: Profile, calibration: Calibration, rate_filter: RateFilterName, is_direct: bool) -> None:
+    """Send made-up samples through every stage, including a replacement of the calibration.
+
+    Parameters
+    ----------
+    profile, calibration, rate_filter
+        Those of the service.
+    is_direct : bool
+        Whether the kernel of `imudrv.service.serve` is needed.
+    """
     layout = profile.layout()
     pulses = np.zeros(_SAMPLES, PULSES)
     pulses["counter"] = layout.counter_step * np.arange(_SAMPLES)
@@ -30,3 +41,5 @@ def warm_up(profile: Profile, calibration: Calibration, rate_filter: RateFilterN
     chain.replace_calibration(coefficients(calibration))
     chain.feed(wire, len(wire))
     chain.close()
+    if is_direct:
+        DescriptorLoop(chain, Latency(0)).run(-1, 0, ClockWatch(), [], False)

@@ -54,6 +54,13 @@ class Backlog:
                 del self._whole[:excess]
                 self.dropped += excess // SIZE
 
+    def written(self, datagrams: bytes, size: int) -> None:
+        """Append datagrams of which the first `size` bytes were written already; nothing may be queued."""
+        whole = -(-size // SIZE)
+        self._begun = datagrams[size : whole * SIZE]
+        self.sent += whole - bool(self._begun)
+        self._whole += datagrams[whole * SIZE :]
+
     def flush(self, write: Callable[[bytes], int]) -> None:
         """Write queued datagrams until the consumer blocks.
 

@@ -1,5 +1,7 @@
 """Datagrams over the network: UDP to one receiver, TCP to every client."""
 
+import errno
+import os
 import select
 import socket
 import time
@@ -7,7 +9,7 @@ from typing import Any, Final, TypeAlias
 
 from imudrv.errors import InputError
 from imudrv.sinks.backlog import Backlog
-from imudrv.sinks.base import Batch, Sink, SinkState
+from imudrv.sinks.base import Batch, Outlet, Sink, SinkState, Written
 from imudrv.url import LOOPBACK, host_and_port, split
 from imudrv.wire.datagram import SIZE
 
@@ -38,6 +40,8 @@ class UdpSink(Sink):
         The address is not valid.
     """
 
+    is_patient = True
+
     def __init__(self, url: str) -> None:
         super().__init__(url)
         family, self._address = _resolve(url, None, socket.SOCK_DGRAM)
@@ -61,6 +65,28 @@ class UdpSink(Sink):
             self._backlog.put(batch.datagrams, self._send)
         except OSError as error:
             self._lost(error)
+
+    def outlets(self) -> list[Outlet]:
+        """See `Sink.outlets`."""
+        is_free = self._is_connected and not self._backlog.queued
+        return [Outlet(self._socket.fileno(), _UDP_PIECE * SIZE)] if is_free else []
+
+    def written(self, batch: Batch, outlets: list[Written]) -> None:
+        """See `Sink.written`."""
+        if not outlets:
+            self.publish(batch)
+            return
+        size, last, error = outlets[0]
+        self._backlog.written(batch.datagrams, size)
+        if size:
+            self._trouble = ""
+            self._last = last // SIZE
+        if error == errno.ECONNREFUSED:
+            self._refused()
+        elif error not in (0, errno.EAGAIN):
+            self._lost(OSError(error, os.strerror(error)))
+        if self._backlog.queued:
+            self.poll()
 
     def poll(self) -> None:
         """Send what is queued; try to connect again."""
@@ -96,14 +122,18 @@ class UdpSink(Sink):
         try:
             written = self._socket.send(packet)
         except ConnectionRefusedError:
-            self._refused_until = time.monotonic() + _REFUSED_S
-            self._backlog.sent -= self._last
-            self._backlog.dropped += self._last
-            self._last = 0
+            self._refused()
             written = self._socket.send(packet)
         self._trouble = ""
         self._last = written // SIZE
         return written
+
+    def _refused(self) -> None:
+        """Count the packet before as dropped: nobody has received it."""
+        self._refused_until = time.monotonic() + _REFUSED_S
+        self._backlog.sent -= self._last
+        self._backlog.dropped += self._last
+        self._last = 0
 
     def _lost(self, error: OSError) -> None:
         """Report a lost connection and drop the queue, which would arrive too late."""
@@ -156,10 +186,13 @@ class TcpSink(Sink):
         The address is not valid or cannot be used.
     """
 
+    is_patient = True
+
     def __init__(self, url: str) -> None:
         super().__init__(url)
         family, address = _resolve(url, LOOPBACK, socket.SOCK_STREAM)
         self._clients: list[_Client] = []
+        self._free: list[_Client] = []  # those that were outlets
         self._sent = self._dropped = 0  # of disconnected clients
         self._listener = socket.socket(family, socket.SOCK_STREAM)
         try:
@@ -175,6 +208,21 @@ class TcpSink(Sink):
         self._listener.setblocking(False)
         host, port = self._listener.getsockname()[:2]
         self._where = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+    def outlets(self) -> list[Outlet]:
+        """See `Sink.outlets`; a client with a queue is none."""
+        self._free = [client for client in self._clients if not client.backlog.queued]
+        return [Outlet(client.connection.fileno(), _TCP_PIECE * SIZE) for client in self._free]
+
+    def written(self, batch: Batch, outlets: list[Written]) -> None:
+        """See `Sink.written`."""
+        for client, (size, _, error) in zip(self._free, outlets, strict=True):
+            client.backlog.written(batch.datagrams, size)
+            if error not in (0, errno.EAGAIN):
+                self._remove(client)
+        for client in [client for client in self._clients if client not in self._free]:
+            if not client.put(batch.datagrams):
+                self._remove(client)
 
     def publish(self, batch: Batch) -> None:
         """Send a batch."""

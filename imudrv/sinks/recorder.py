@@ -87,7 +87,7 @@ class Recorder:
         self._can = layout.can
         self._wire: _Queue[Arrival] = _Queue(attrgetter("size"))
         self._datagrams: _Queue[bytes] = _Queue(len)
-        self._notes: deque[tuple[int, int, Mapping[str, object]]] = deque(maxlen=1000)
+        self._notes: deque[tuple[int, int, Callable[[], Mapping[str, object]]]] = deque(maxlen=1000)
         self._calibrations: deque[tuple[int, bytes]] = deque(maxlen=10)
         self._put = 0
         self._reported = 0
@@ -127,15 +127,15 @@ class Recorder:
         self._wire.put(*(moment.arrival for moment in moments))
         self._datagrams.put(*datagrams)
 
-    def status(self, status: Mapping[str, object]) -> None:
+    def status(self, document: Callable[[], Mapping[str, object]]) -> None:
         """Record the state of the service.
 
         Parameters
         ----------
-        status : mapping
-            Values that JSON can represent; it must not change any more.
+        document : callable
+            Returns values that JSON can represent; called in the writing thread.
         """
-        self._notes.append((now_ns(), _STATUS, status))
+        self._notes.append((now_ns(), _STATUS, document))
 
     def event(self, t_ns: int, text: str) -> None:
         """Record an event.
@@ -147,7 +147,7 @@ class Recorder:
         text : str
             What happened.
         """
-        self._notes.append((t_ns, _EVENTS, {"text": text}))
+        self._notes.append((t_ns, _EVENTS, lambda: {"text": text}))
 
     def calibration(self, t_ns: int, calibration: bytes) -> None:
         """Record a new calibration.
@@ -236,7 +236,7 @@ class Recorder:
         with suppress(IndexError):
             while True:
                 t_ns, channel, document = self._notes.popleft()
-                self._message(channel, t_ns, json.dumps(document, default=str).encode())
+                self._message(channel, t_ns, json.dumps(document(), default=str).encode())
         more = max(len(arrivals), len(batches)) == _PIECE
         return Piece(self._staging.take(), len(datagrams) // SIZE, more)
 
