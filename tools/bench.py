@@ -287,9 +287,12 @@ def show(measures: list[Measure], how: str) -> None:
 
 def show_live(quantiles: dict[str, dict[str, float]]) -> None:
     """Print a table."""
-    table = Table("latency from unit to receiver", *quantiles["ratio"])
+    table = Table("latency from unit to receiver", *next(iter(quantiles.values())))
     for which, row in quantiles.items():
-        table.add_row(which, *(f"{x:.2f}" if which == "ratio" else f"{x * 1e6:.0f} us" for x in row.values()))
+        units = {name: f"{x:.2f}" if "/" in which else f"{x * 1e6:.0f} us" for name, x in row.items()}
+        if "cpu" in row:
+            units["cpu"] = f"{100 * row['cpu']:.1f} %"
+        table.add_row(which, *units.values())
     Console().print(table)
 
 
