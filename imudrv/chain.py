@@ -216,7 +216,7 @@ class Chain:
         samples, increments, rejected, *_ = self._flow.item()
         if rejected:
             decoder = self.decoder.decoder
-            rejects = decoder.arrays[-1] if isinstance(decoder, StreamDecoder) else self._rejects
+            rejects = decoder.arrays[3] if isinstance(decoder, StreamDecoder) else self._rejects
             self.decoder.count_rejects(rejects[:rejected])
         return Output(
             self._samples[:samples].copy(),

@@ -114,9 +114,9 @@ def test_any_reads_give_the_bits_of_the_chain_fed_by_python(line: Line) -> None:
 
 def test_each_read_keeps_its_time_its_bytes_and_its_samples(line: Line) -> None:
     pieces = [frames(0, 3), frames(3, 2)[:50], frames(3, 2)[50:], frames(5, 4)]
+    assert line.run(seconds=0.0).why is Why.HOUSEKEEPING
     for piece in pieces:
         line.unit.send(piece)
-    assert line.run(seconds=0.0).why is Why.HOUSEKEEPING
     served = line.run(seconds=1.0)
     assert served.why is Why.HOUSEKEEPING
     arrivals = list(served.arrivals(Timebase(7)))

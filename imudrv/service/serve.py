@@ -60,6 +60,8 @@ from imudrv.wire.stream import StreamArrays, StreamDecoder
 AT_ONCE: Final = 1 << 16
 """Most bytes of one read."""
 _READS: Final = 4  # of that size, until the buffers are full
+_GRACE_NS: Final = 5_000_000
+"""How much later to return, at most, so that it is right after a read: then the next one is farthest away."""
 
 SERVE: Final = np.dtype(
     [
@@ -271,13 +273,13 @@ def serve(
         ):
             return Why.FULL
         left_ns = s["until_ns"] - clock_ns(CLOCK_BOOTTIME, timespec) - s["offset_ns"]
-        if left_ns <= 0:
+        if left_ns <= (0 if s["reads"] > 0 else -_GRACE_NS):
             return Why.HOUSEKEEPING
-        ready = poll(descriptor, left_ns)
+        ready = poll(descriptor, left_ns + _GRACE_NS)
         if ready < 0:
             return Why.SIGNAL
         if ready == 0:
-            continue
+            return Why.HOUSEKEEPING
         if _has_stepped(s, timespec):
             return Why.CLOCKS
         size = read(s["fd"], buffer[state["pending"] : state["pending"] + AT_ONCE])

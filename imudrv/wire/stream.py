@@ -19,7 +19,6 @@ STATE: Final = np.dtype(
     [
         ("offset", np.int64),  # of the buffer's first byte in the stream
         ("pending", np.int64),  # bytes of an incomplete message at the beginning of the buffer
-        ("is_usual", np.bool_),  # one kind of message with plain fields and at most a plain check
         ("reject_offset", np.int64),  # where the run of rejected bytes begins that is still open; -1: none
         ("reject_reason", np.int64),
         ("skipped", np.int64),  # rejected bytes since the last frame
@@ -37,8 +36,11 @@ STATE: Final = np.dtype(
 )
 """State that a call of the kernel leaves to the next."""
 
-StreamArrays: TypeAlias = tuple[NDArray[np.uint8], Tables, Records, Records]
-"""Buffer, tables of the layout, state, room for rejects."""
+StreamArrays: TypeAlias = tuple[NDArray[np.uint8], Tables, Records, Records, bool | None]
+"""Buffer, tables of the layout, state, room for rejects, and whether `_scan_kinds` is needed.
+
+None instead of False: then numba compiles only the other one.
+"""
 
 _NO_SYNC: Final = int(Reason.NO_SYNC)
 _CHECK_FAILED: Final = int(Reason.CHECK_FAILED)
@@ -82,8 +84,8 @@ class StreamDecoder:
         is_usual = (
             len(layout.messages) == 1 and not only.multiplexed and only.checks in ((), (only.plain_check,))
         )
+        self._has_kinds = None if is_usual else True
         self._state = np.zeros(1, STATE)
-        self._state["is_usual"] = is_usual
         self._buffer: NDArray[np.uint8] = np.zeros(0, np.uint8)
         self._rejects = np.zeros(0, REJECT)
         self._end: NDArray[np.int64] = np.zeros(1, np.int64)  # of the one read of `feed`
@@ -112,7 +114,7 @@ class StreamDecoder:
     @property
     def arrays(self) -> StreamArrays:
         """Arguments of `decode`; valid until `reserve` makes the buffer larger."""
-        return self._buffer, self._tables, self._state, self._rejects
+        return self._buffer, self._tables, self._state, self._rejects, self._has_kinds
 
     def reserve(self, size: int) -> None:
         """Make room in the buffer for so many bytes besides the pending ones, now and later."""
@@ -216,6 +218,7 @@ def decode(
     tables: Tables,
     state: Records,
     rejects: Records,
+    has_kinds: bool | None,
     frames: Records,
 ) -> tuple[int, int]:
     """Decode the new bytes of the buffer, which follow the pending ones; what remains moves to its beginning.
@@ -226,7 +229,7 @@ def decode(
         Where each read ends in the new bytes.
     times : ndarray of int64, shape (n,)
         Time of arrival of each read.
-    buffer, tables, state, rejects
+    buffer, tables, state, rejects, has_kinds
         `StreamDecoder.arrays`.
     frames : ndarray of FRAME
         Receives the frames, see `StreamDecoder.most_frames`.
@@ -241,7 +244,7 @@ def decode(
         return 0, 0
     begin = s["pending"]
     stop = begin + ends[-1]
-    if s["is_usual"]:
+    if has_kinds is None:
         position, found, rejected = _scan(buffer, begin, ends, times, tables, state, frames, rejects)
     else:
         position, found, rejected = _scan_kinds(buffer, begin, ends, times, tables, state, frames, rejects)
