@@ -19,8 +19,8 @@ from imudrv.kernels import kernel
 _numba: Any = numba  # has no type hints
 _types, _carray = _numba.types, _numba.carray
 
-IS_AVAILABLE: bool = sys.platform == "linux" and hasattr(_types, "ExternalFunction")
-"""Whether kernels can call the system."""
+IS_AVAILABLE: bool = sys.platform == "linux" and sys.maxsize > 2**32 and hasattr(_types, "ExternalFunction")
+"""Whether kernels can call the system; structures are those of 64 bits."""
 
 POLL: Final = np.dtype([("fd", np.int32), ("events", np.int16), ("revents", np.int16)])
 """A descriptor to wait for: struct pollfd of poll(2)."""
