@@ -299,7 +299,8 @@ def feed_bytes(
     stages
         `Chain.stages`.
     """
-    found, stages[9][0]["rejected"] = decode(ends, times, *decoder, stages[0][1:])
+    frames, flow = stages[0], stages[-1][0]
+    found, flow["rejected"] = decode(ends, times, *decoder, frames[1:])
     if found:
         _through(found, *stages)
 
@@ -319,7 +320,8 @@ def feed_messages(messages: Records, assembler: CanArrays, rejects: Records, sta
     stages
         `Chain.stages`.
     """
-    found, stages[9][0]["rejected"] = assemble(messages, *assembler, rejects, stages[0][1:])
+    frames, flow = stages[0], stages[-1][0]
+    found, flow["rejected"] = assemble(messages, *assembler, rejects, frames[1:])
     if found:
         _through(found, *stages)
 

@@ -125,7 +125,13 @@ class Service:
             self._port.source,
         )
         self._latency = Latency(self._layout.interval_ns)
-        is_direct = system.IS_AVAILABLE and clock is now_ns and clock_watch is None and not self._layout.can
+        is_direct = (
+            system.IS_AVAILABLE
+            and clock is now_ns
+            and clock_watch is None
+            and in_real_time
+            and not self._layout.can
+        )
         self._descriptor_loop = DescriptorLoop(self._chain, self._latency) if is_direct else None
         self._signals = signals or SignalFlags()
         self._manager = SystemdNotifier()

@@ -260,16 +260,18 @@ def serve(
     int
         A `Why`.
     """
-    s, flow, state = settings[0], stages[9][0], decoder[2][0]
-    buffer, datagrams = decoder[0], stages[3]
-    most = len(stages[0]) + MAX_TAPS  # rows of one read
+    frames, samples, increments, datagrams, _, _, _, _, _, flows = stages
+    buffer, _, states, _, _ = decoder
+    s, flow, state = settings[0], flows[0], states[0]
+    most = len(frames) + MAX_TAPS  # rows of one read
+    end, time = np.zeros(1, np.int64), np.zeros(1, np.int64)  # of the one read
     descriptor[0]["fd"], descriptor[0]["events"] = s["fd"], POLLIN
     while True:
         if (
             s["reads"] == len(reads)
             or s["bytes"] + AT_ONCE > len(wire)
-            or flow["samples"] + most > len(stages[1])
-            or flow["increments"] + most > len(stages[2])
+            or flow["samples"] + most > len(samples)
+            or flow["increments"] + most > len(increments)
         ):
             return Why.FULL
         left_ns = s["until_ns"] - clock_ns(CLOCK_BOOTTIME, timespec) - s["offset_ns"]
@@ -292,7 +294,8 @@ def serve(
             wire[s["bytes"] + k] = buffer[state["pending"] + k]
         s["bytes"] += size
         begin = flow["increments"]
-        feed_bytes(size, t_ns, decoder, stages)
+        end[0], time[0] = size, t_ns
+        feed_bytes(end, time, decoder, stages)
         row = reads[s["reads"]]
         row["t_ns"], row["stop"] = t_ns, s["bytes"]
         row["samples"], row["increments"] = flow["samples"], flow["increments"]
