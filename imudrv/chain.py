@@ -203,6 +203,11 @@ class Chain:
             self._gather()
 
     @property
+    def rejects(self) -> Records:
+        """Argument of `feed_messages`; valid until `reserve` is called."""
+        return self._rejects
+
+    @property
     def stages(self) -> Stages:
         """Arguments of the kernels; valid until `reserve` or `replace_calibration` is called."""
         return self._stages

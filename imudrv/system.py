@@ -39,6 +39,7 @@ if IS_AVAILABLE:
     _poll = _types.ExternalFunction("poll", _types.intc(_types.intp, _types.uintp, _types.intc))
     _read = _types.ExternalFunction("read", _types.intp(_types.intc, _types.intp, _types.uintp))
     _write = _types.ExternalFunction("write", _types.intp(_types.intc, _types.intp, _types.uintp))
+    _recv = _types.ExternalFunction("recv", _types.intp(_types.intc, _types.intp, _types.uintp, _types.intc))
     _send = _types.ExternalFunction("send", _types.intp(_types.intc, _types.intp, _types.uintp, _types.intc))
     _clock = _types.ExternalFunction("clock_gettime", _types.intc(_types.intc, _types.intp))
     _errno = _types.ExternalFunction("__errno_location", _types.CPointer(_types.int32)())
@@ -79,6 +80,13 @@ def send(fd: int, data: NDArray[np.uint8]) -> int:
     """Send an array over a socket without waiting; return the number of bytes that were taken."""
     flags = np.int32(_MSG_DONTWAIT | _MSG_NOSIGNAL)
     count = _send(np.int32(fd), data.ctypes.data, np.uint64(data.size), flags)
+    return int(count) if count >= 0 else -int(_carray(_errno(), 1)[0])
+
+
+@kernel
+def recv(fd: int, data: NDArray[np.uint8]) -> int:
+    """Receive a packet of a socket into an array without waiting; return its number of bytes."""
+    count = _recv(np.int32(fd), data.ctypes.data, np.uint64(data.size), np.int32(_MSG_DONTWAIT))
     return int(count) if count >= 0 else -int(_carray(_errno(), 1)[0])
 
 

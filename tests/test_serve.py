@@ -4,6 +4,7 @@ import os
 import pty
 import signal
 import socket
+import struct
 import threading
 import time
 import tty
@@ -11,6 +12,7 @@ from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
+import can
 import numpy as np
 import pytest
 from realtime import DEADLINE_S, until
@@ -19,7 +21,10 @@ from imudrv import compensate, system
 from imudrv.calibration import coefficients, write_calibration
 from imudrv.chain import Chain
 from imudrv.hostclock import now_ns
+from imudrv.ports.base import OTHER_END_GONE
+from imudrv.ports.socketcan import BUS_OFF
 from imudrv.profiles import load
+from imudrv.profiles.schema import Profile
 from imudrv.recording.reader import Recording
 from imudrv.records import PULSES, Flag, Records, Timebase
 from imudrv.service.clock_watch import ClockWatch
@@ -32,12 +37,17 @@ from imudrv.sinks.backlog import Backlog
 from imudrv.sinks.base import Batch, Outlet, Sink, SinkState
 from imudrv.units import NS_PER_S
 from imudrv.wire.datagram import SIZE
-from imudrv.wire.encode import StreamEncoder
+from imudrv.wire.encode import CanEncoder, StreamEncoder
 
 pytestmark = pytest.mark.skipif(not system.IS_AVAILABLE, reason="needs Linux")
 
 PROFILE = load("imu50-rs422")
 LENGTH = PROFILE.layout().messages[0].length
+
+
+CAN_PROFILE = load("imu50-canfd")
+CAN_FRAME = struct.Struct("=IBBxx64s")
+CLASSIC_BYTES = 16
 
 
 def frames(first: int, count: int) -> bytes:
@@ -46,6 +56,14 @@ def frames(first: int, count: int) -> bytes:
     samples["gyro"] = np.rint(100.0 * np.sin(samples["counter"] / 50.0))[:, None]
     samples["accelerometer"] = [0, 0, 20]
     return StreamEncoder(PROFILE.layout()).encode(samples).tobytes()
+
+
+def can_frames(first: int, count: int) -> list[bytes]:
+    samples = np.zeros(count, PULSES)
+    samples["counter"] = first + np.arange(count)
+    samples["gyro"] = np.rint(100.0 * np.sin(samples["counter"] / 50.0))[:, None]
+    messages = CanEncoder(CAN_PROFILE.layout()).encode(samples)
+    return [CAN_FRAME.pack(m["id"], m["length"], 4, bytes(m["data"])) for m in messages]
 
 
 def assert_same(one: Records | bytes, other: Records | bytes) -> None:
@@ -59,8 +77,8 @@ def assert_same(one: Records | bytes, other: Records | bytes) -> None:
 class Line:
     """A kernel at one end of a socket pair whose packets keep their boundaries."""
 
-    def __init__(self) -> None:
-        self.chain = Chain(PROFILE, coefficients(NOMINAL), "dither")
+    def __init__(self, profile: Profile = PROFILE) -> None:
+        self.chain = Chain(profile, coefficients(NOMINAL), "dither")
         self.latency = Latency(NS_PER_S)
         self.clocks = ClockWatch()
         self.loop = DescriptorLoop(self.chain, self.latency)
@@ -81,6 +99,7 @@ class Line:
     def close(self) -> None:
         self.unit.close()
         self.port.close()
+        self.loop.close()
 
 
 @pytest.fixture
@@ -258,6 +277,71 @@ def test_an_outlet_that_blocks_gets_the_rest_from_its_queue_to_the_byte(line: Li
     good.close()
 
 
+def test_another_thread_ends_the_wait(line: Line) -> None:
+    timer = threading.Timer(0.05, line.loop.pipe.wake)
+    timer.start()
+    assert line.run(seconds=DEADLINE_S).why is Why.WOKEN
+    timer.join()
+    assert line.run(seconds=0.01).why is Why.HOUSEKEEPING  # it waits anew
+
+
+@pytest.fixture
+def bus() -> Iterator[Line]:
+    bus = Line(CAN_PROFILE)
+    yield bus
+    bus.close()
+
+
+def test_messages_of_a_can_socket_give_the_bits_of_the_chain_fed_by_python(bus: Line) -> None:
+    python = Chain(CAN_PROFILE, coefficients(NOMINAL), "dither")
+    sent = can_frames(0, 300) + can_frames(310, 200)
+    del sent[17::97]  # lost on the bus
+    random, at = np.random.default_rng(3), 0
+    while at < len(sent):
+        stop = at + int(random.integers(1, 60))
+        for frame in sent[at:stop]:
+            bus.unit.send(frame)
+        served = bus.next_read()
+        assert isinstance(served.data, np.ndarray)
+        assert len(served.data) == len(sent[at:stop])
+        for mine, its in zip(served.output, python.feed(served.data, 0), strict=True):
+            assert_same(mine, its)
+        at = stop
+    assert bus.chain.tracker.counts == python.tracker.counts
+    assert bus.chain.tracker.counts.lost > 10
+    assert bus.chain.decoder.rejected == python.decoder.rejected
+
+
+def test_messages_of_a_socket_are_read_as_the_driver_defines_them(bus: Line) -> None:
+    remote, error, extended = 1 << 30, 1 << 29, 1 << 31
+    before = now_ns()
+    bus.unit.send(CAN_FRAME.pack(0x150, 3, 0, b"abc")[:CLASSIC_BYTES])
+    bus.unit.send(CAN_FRAME.pack(0x151 | remote, 0, 0, b"")[:CLASSIC_BYTES])
+    bus.unit.send(CAN_FRAME.pack(error | 4, 8, 0, b"")[:CLASSIC_BYTES])
+    bus.unit.send(b"no frame")
+    bus.unit.send(CAN_FRAME.pack(0x18000150 | extended, 64, 4, bytes(range(64))))
+    bus.unit.send(CAN_FRAME.pack(0x152, 255, 0, b"12345678")[:CLASSIC_BYTES])  # no driver sends such a length
+    (messages,) = [bus.run(seconds=0.05).data]
+    assert isinstance(messages, np.ndarray)
+    assert messages["id"].tolist() == [0x150, 0x18000150 | extended, 0x152]
+    assert messages["length"].tolist() == [3, 64, 8]
+    assert messages["fd"].tolist() == [0, 1, 0]
+    assert [bytes(m["data"][:4]) for m in messages] == [b"abc\0", bytes(range(4)), b"1234"]
+    assert np.all(np.diff([before, *messages["t_ns"], now_ns()]) >= 0)
+
+
+def test_the_end_of_a_can_bus_comes_after_its_last_messages(bus: Line) -> None:
+    frames = can_frames(0, 2)
+    for frame in frames:
+        bus.unit.send(frame)
+    bus.unit.send(CAN_FRAME.pack((1 << 29) | 0x40, 8, 0, b"")[:CLASSIC_BYTES])
+    served = bus.run()
+    assert (served.why, served.error, len(served.data)) == (Why.GONE, BUS_OFF, len(frames))
+    bus.unit.close()
+    served = bus.run()
+    assert (served.why, served.error, len(served.data)) == (Why.GONE, OTHER_END_GONE, 0)
+
+
 class Collected(Sink):
     """Keeps increments."""
 
@@ -278,6 +362,73 @@ class Collected(Sink):
 
     def close(self) -> None:
         pass
+
+
+class PairBus(can.BusABC):
+    """SocketCAN bus as python-can opens it, whose socket is one end of a pair: there may be no CAN here."""
+
+    def __init__(self, *_: object, **__: object) -> None:
+        self.unit, self.socket = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        super().__init__("can0")
+        opened.append(self)
+
+    def fileno(self) -> int:
+        return self.socket.fileno()
+
+    def send(self, *_: object, **__: object) -> None:
+        raise NotImplementedError
+
+    def shutdown(self) -> None:
+        super().shutdown()
+        self.unit.close()
+        self.socket.close()
+
+
+opened: list[PairBus] = []
+"""Buses of the running test."""
+
+
+@pytest.mark.parametrize("is_direct", [True, False])
+def test_a_can_bus_is_served_and_opened_again_after_bus_off(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_direct: bool
+) -> None:
+    monkeypatch.setattr(can, "Bus", PairBus)
+    opened.clear()
+    write_calibration(tmp_path / "unit.yaml", NOMINAL)
+    settings = Settings(
+        port="can://socketcan/can0",
+        profile=CAN_PROFILE.name,
+        calibration=str(tmp_path / "unit.yaml"),
+        status=str(tmp_path / "socket"),
+        record=str(tmp_path / "record.mcap"),
+    )
+    own, said = Collected(), list[str]()
+    # With a watch of its own, the service reads the port by Python.
+    service = Service(settings, said.append, [own], clock_watch=None if is_direct else ClockWatch())
+
+    def act() -> None:
+        until(lambda: len(opened) == 1, "the bus")
+        for frame in can_frames(0, 500):
+            opened[0].unit.send(frame)
+        until(lambda: own.samples >= 498, "its samples")
+        opened[0].unit.send(CAN_FRAME.pack((1 << 29) | 0x40, 8, 0, b"")[:CLASSIC_BYTES])
+        until(lambda: len(opened) == 2, "the bus opened again")
+        for frame in can_frames(600, 100):
+            opened[1].unit.send(frame)
+        until(lambda: own.samples >= 598, "samples after it")
+        service.stop()
+
+    worker = threading.Thread(target=act)
+    worker.start()
+    service.run()
+    worker.join(DEADLINE_S)
+    counts = service.status.samples
+    assert (counts.good, counts.lost) == (600, 100)
+    assert any("the controller is bus-off" in line for line in said)
+    live = np.concatenate(own.pieces)
+    assert live["counter"].tolist() == [*range(500), *range(600, 700)]
+    recorded = np.concatenate(list(Recording(tmp_path / "record.mcap").increments()))
+    np.testing.assert_array_equal(recorded, live)
 
 
 @pytest.mark.parametrize("is_direct", [True, False])

@@ -12,7 +12,7 @@ import json
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
@@ -125,14 +125,10 @@ class Service:
             self._port.source,
         )
         self._latency = Latency(self._layout.interval_ns)
-        is_direct = (
-            system.IS_AVAILABLE
-            and clock is now_ns
-            and clock_watch is None
-            and in_real_time
-            and not self._layout.can
+        is_direct = system.IS_AVAILABLE and clock is now_ns and clock_watch is None
+        self._descriptor_loop = (
+            DescriptorLoop(self._chain, self._latency, in_real_time) if is_direct else None
         )
-        self._descriptor_loop = DescriptorLoop(self._chain, self._latency) if is_direct else None
         self._signals = signals or SignalFlags()
         self._manager = SystemdNotifier()
         self._notices: list[str] = []
@@ -144,6 +140,8 @@ class Service:
         self._last_pulses = np.zeros(1, PULSES)
         self._last_increments = np.zeros(1, INCREMENTS)
         with ExitStack() as undo:
+            if self._descriptor_loop is not None:
+                undo.callback(self._descriptor_loop.close)
             self._sinks = list(sinks)
             for sink in sinks:
                 undo.callback(sink.close)
@@ -167,7 +165,11 @@ class Service:
             self._events.failure(refusal)
         is_direct = self._descriptor_loop is not None and self._port.source is Source.HARDWARE
         warm_up(self._profile, self._calibration.current.model, self._settings.rate_filter, is_direct)
-        with self._signals.caught(SIGTERM, SIGINT, SIGHUP), frozen_gc():
+        with (
+            self._signals.caught(SIGTERM, SIGINT, SIGHUP),
+            self._descriptor_loop.pipe.woken_by_signals() if self._descriptor_loop else nullcontext(),
+            frozen_gc(),
+        ):
             try:
                 self._publish_status(self._clock())
                 self._manager.notify("READY=1")
@@ -219,6 +221,7 @@ class Service:
     def stop(self) -> None:
         """End `run`, as SIGTERM does; for any thread."""
         self._signals.stop = True
+        self._wake()
 
     @property
     def port_state(self) -> LineState:
@@ -248,7 +251,13 @@ class Service:
             Done when the recording before is closed; has the `InputError` if the new one cannot be created.
             Cancelled if the service ends first, which closes the recording before as well.
         """
-        return self._recordings.request(path, since)
+        done = self._recordings.request(path, since)
+        self._wake()
+        return done
+
+    def _wake(self) -> None:
+        if self._descriptor_loop is not None:
+            self._descriptor_loop.pipe.wake()
 
     def _serve(self) -> bool:
         """Let the kernel serve the port, if it can; return whether Python need not read it now."""
@@ -267,7 +276,9 @@ class Service:
         )
         if len(served.reads):
             self._take(served, [len(some) for some in outlets])
-        return served.why not in (Why.CLOCKS, Why.GONE)
+        if served.error:
+            self._port.failed(served.error)
+        return served.why is not Why.CLOCKS
 
     def _take(self, served: Served, outlets: Sequence[int]) -> None:
         """Publish and record what the kernel has read; `outlets`: their number, for each sink."""

@@ -101,14 +101,22 @@ class PortSupervisor:
         try:
             arrival = port.read(timeout_s)
         except PortLostError as lost:
-            self.close()
-            self.state = LineState("lost", str(lost))
-            self._events.failure(str(self.state))
+            self._lose(lost)
             return None
         except PortEndedError:
             self.state = LineState("ended")
             raise
         return arrival if len(arrival.data) else None
+
+    def failed(self, error: int) -> None:
+        """Take note of an error that a reader of the descriptor has received, see `Port.fault`."""
+        if self._port is not None:
+            self._lose(self._port.fault(error))
+
+    def _lose(self, lost: PortLostError) -> None:
+        self.close()
+        self.state = LineState("lost", str(lost))
+        self._events.failure(str(self.state))
 
     @property
     def descriptor(self) -> int | None:

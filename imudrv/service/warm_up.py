@@ -1,5 +1,6 @@
 """Compile and load every stage before the unit is connected."""
 
+from contextlib import closing
 from typing import Final
 
 import numpy as np
@@ -42,4 +43,5 @@ def warm_up(profile: Profile, calibration: Calibration, rate_filter: RateFilterN
     chain.feed(wire, len(wire))
     chain.close()
     if is_direct:
-        DescriptorLoop(chain, Latency(0)).run(-1, 0, ClockWatch(), [], False)
+        with closing(DescriptorLoop(chain, Latency(0))) as loop:
+            loop.run(-1, 0, ClockWatch(), [], False)
