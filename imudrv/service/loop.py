@@ -325,7 +325,8 @@ class Service:
     def _poll(self, now: int) -> None:
         for sink in self._sinks:
             sink.poll()
-        self._recordings.poll()
+        if displaced := self._recordings.poll():
+            self._events.failure(displaced)
         self._port.check_line(now)
         # At a wrong rate they do not cover the interval that they name.
         self._chain.allow_valid(self._port.state.name != "wrong rate")
@@ -416,4 +417,5 @@ class Service:
             source=self._port.source,
             port=self._settings.port,
             unit=self._calibration.current.model.serial_number,
+            sync_s=self._settings.sync_s,
         )

@@ -14,6 +14,8 @@ from imudrv.url import LOOPBACK, host_and_port, split
 from imudrv.wire.datagram import SIZE
 
 MAX_CLIENTS: Final = 32
+STALLED_S: Final = 5.0
+"""Time after which a client that takes nothing loses its place."""
 _UDP_PIECE: Final = 18  # 1368 bytes: with its headers within an Ethernet frame
 _TCP_PIECE: Final = 256
 _RETRY_S: Final = 0.5
@@ -149,6 +151,7 @@ class _Client:
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.connection = connection
         self.backlog = Backlog(_TCP_PIECE)
+        self._sent, self._since = 0, time.monotonic()
 
     def put(self, datagrams: bytes) -> bool:
         """Send datagrams; return whether the client is still connected."""
@@ -168,11 +171,19 @@ class _Client:
         except OSError:
             return False
 
+    def has_stalled(self) -> bool:
+        """Whether samples have waited for `STALLED_S` without any being taken; call it after `service`."""
+        now = time.monotonic()
+        if self.backlog.sent != self._sent or not self.backlog.queued:
+            self._sent, self._since = self.backlog.sent, now
+        return now - self._since >= STALLED_S
+
 
 class TcpSink(Sink):
     """TCP server; each client has its own queue, and one that stops reading loses only its own samples.
 
-    A client that shuts down its sending side counts as disconnected.
+    A client that shuts down its sending side counts as disconnected. One that takes nothing for `STALLED_S`
+    is disconnected and counted.
 
     Parameters
     ----------
@@ -194,6 +205,7 @@ class TcpSink(Sink):
         self._clients: list[_Client] = []
         self._free: list[_Client] = []  # those that were outlets
         self._sent = self._dropped = 0  # of disconnected clients
+        self._stalled = 0  # clients
         self._listener = socket.socket(family, socket.SOCK_STREAM)
         try:
             self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -231,8 +243,12 @@ class TcpSink(Sink):
 
     def poll(self) -> None:
         """Accept new clients, remove disconnected ones, send what is queued."""
-        for client in [client for client in self._clients if not client.service()]:
-            self._remove(client)
+        for client in list(self._clients):
+            if not client.service():
+                self._remove(client)
+            elif client.has_stalled():
+                self._stalled += 1
+                self._remove(client)
         for _ in range(MAX_CLIENTS):
             try:
                 connection, _ = self._listener.accept()
@@ -248,10 +264,11 @@ class TcpSink(Sink):
         """Current state."""
         count = len(self._clients)
         clients = "1 client" if count == 1 else f"{count} clients" if count else "waiting for a client"
+        stalled = f"; {self._stalled} disconnected that took nothing for {STALLED_S:g} s"
         counts = [client.backlog for client in self._clients]
         return SinkState(
             self.url,
-            f"{clients} on {self._where}",
+            f"{clients} on {self._where}{stalled if self._stalled else ''}",
             True,
             self._sent + sum(c.sent for c in counts),
             self._dropped + sum(c.dropped for c in counts),

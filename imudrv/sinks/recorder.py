@@ -65,6 +65,8 @@ class Recorder:
         URL of the port.
     unit : str
         Serial number of the unit; empty if not known.
+    sync_s : float, optional
+        See `imudrv.files.spool.AppendThread`.
 
     Raises
     ------
@@ -82,6 +84,7 @@ class Recorder:
         source: Source,
         port: str,
         unit: str,
+        sync_s: float | None = None,
     ) -> None:
         self._path = path
         self._can = layout.can
@@ -96,7 +99,12 @@ class Recorder:
         self._staging = _Staging()
         self._writer = Writer(self._staging, use_chunking=False, use_statistics=False)
         self._begin(profile, calibration, source, port, unit)
-        self._spool = AppendThread(path, self._staging.take(), self._next_piece, self._last_piece)
+        self._spool = AppendThread(path, self._staging.take(), self._next_piece, self._last_piece, sync_s)
+
+    @property
+    def displaced(self) -> str:
+        """What has happened to the file, such as ``deleted``; empty while its name leads to it."""
+        return self._spool.displaced
 
     def arrived(self, arrival: Arrival) -> None:
         """Record a read of the port; call it before the data are used.

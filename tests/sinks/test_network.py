@@ -163,8 +163,9 @@ def test_a_tcp_client_gets_every_sample_from_its_connection_on(tcp: TcpSink, bat
 
 
 def test_a_tcp_client_that_stops_reading_loses_only_its_own_oldest_samples(
-    tcp: TcpSink, batch, wait_for
+    tcp: TcpSink, batch, wait_for, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(network, "STALLED_S", 3600.0)
     with connect(tcp, wait_for, receive_buffer=1 << 16) as stuck, connect(tcp, wait_for) as good:
         got, rest = bytearray(), bytearray()
         samples = 0
@@ -202,6 +203,28 @@ def test_a_killed_tcp_client_is_detected_by_writing(tcp: TcpSink, batch, wait_fo
     client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")  # close with a reset
     client.close()
     wait_for(lambda: tcp.publish(batch(0, 1)) or not clients_of(tcp))
+
+
+def test_tcp_clients_that_take_nothing_lose_their_places_and_are_counted(
+    tcp: TcpSink, batch, wait_for, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(network, "STALLED_S", 0.2)
+    port = port_of(tcp)
+    stuck = [connect(tcp, wait_for, receive_buffer=1 << 12) for _ in range(MAX_CLIENTS - 1)]
+    got, samples = bytearray(), 0
+    with connect(tcp, wait_for) as good:
+        while clients_of(tcp) > 1:
+            tcp.publish(batch(samples, 500))
+            samples += 500
+            wait_for(lambda sent=samples: tcp.poll() or take(good, got) == sent * SIZE)
+        assert counters(bytes(got)) == list(range(samples))
+        assert f"; {MAX_CLIENTS - 1} disconnected that took nothing" in tcp.state.state
+        with socket.create_connection(("127.0.0.1", port), timeout=DEADLINE_S) as late:
+            wait_for(lambda: tcp.poll() or clients_of(tcp) == 2)
+            tcp.publish(batch(samples, 1))
+            assert counters(read(late, 1)) == [samples]
+    for client in stuck:
+        client.close()
 
 
 def test_tcp_clients_beyond_the_maximum_are_refused(tcp: TcpSink, wait_for) -> None:
