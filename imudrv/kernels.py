@@ -15,7 +15,14 @@ from numba.core import config
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-CONSTANTS: Final = ("arrays.py", "records.py", "units.py", "wire/layout.py", "wire/tables.py")
+CONSTANTS: Final = (
+    "arrays.py",
+    "records.py",
+    "units.py",
+    "service/clock_watch.py",
+    "wire/layout.py",
+    "wire/tables.py",
+)
 """Files without kernels whose constants and types kernels read."""
 
 

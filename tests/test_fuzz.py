@@ -39,7 +39,7 @@ def test_a_decoder_that_loses_a_byte_is_found_and_its_input_reduced(
     close = StreamDecoder.close
 
     def forgetful(decoder: StreamDecoder) -> Decoded:
-        decoder._pending = 0
+        decoder._state["pending"] = 0
         return close(decoder)
 
     monkeypatch.setattr(StreamDecoder, "close", forgetful)

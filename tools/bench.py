@@ -2,7 +2,7 @@
 """Measure the speed of each stage, compared with what a user would otherwise write.
 
     tools/run python tools/bench.py [--rounds N] [--json]
-    tools/run python tools/bench.py live [--seconds N] [--rounds N] [--json]
+    tools/run python tools/bench.py live|can [--seconds N] [--rounds N] [--json]
     tools/run python tools/bench.py nav [--rounds N] [--json]
 
 A capture with damaged frames passes all stages, piece by piece, in one process on one core. Absolute figures
@@ -25,7 +25,7 @@ from typing import Final
 
 import numba
 import numpy as np
-from bench_live import live
+from bench_live import TRANSPORTS, live
 from bench_nav import Measure, nav
 from numpy.typing import NDArray
 from rich.console import Console
@@ -287,9 +287,12 @@ def show(measures: list[Measure], how: str) -> None:
 
 def show_live(quantiles: dict[str, dict[str, float]]) -> None:
     """Print a table."""
-    table = Table("latency from unit to receiver", *quantiles["ratio"])
+    table = Table("latency from unit to receiver", *next(iter(quantiles.values())))
     for which, row in quantiles.items():
-        table.add_row(which, *(f"{x:.2f}" if which == "ratio" else f"{x * 1e6:.0f} us" for x in row.values()))
+        units = {name: f"{x:.2f}" if "/" in which else f"{x * 1e6:.0f} us" for name, x in row.items()}
+        if "cpu" in row:
+            units["cpu"] = f"{100 * row['cpu']:.1f} %"
+        table.add_row(which, *units.values())
     Console().print(table)
 
 
@@ -300,7 +303,7 @@ def main() -> None:
     parser.add_argument(
         "what",
         nargs="?",
-        choices=("stages", "live", "nav"),
+        choices=("stages", "live", "can", "nav"),
         default="stages",
         help="default: stages of the driver",
     )
@@ -313,11 +316,11 @@ def main() -> None:
         "--seconds", type=int, default=20, help="duration of a live round (default: %(default)s)"
     )
     options = parser.parse_args()
-    rounds = options.rounds or {"stages": 12, "live": 3, "nav": 5}[options.what]
+    rounds = options.rounds or {"stages": 12, "live": 3, "can": 3, "nav": 5}[options.what]
     if rounds < 1 or options.seconds < 1:
         parser.error("--rounds, --seconds: expected 1 or more")
-    if options.what == "live":
-        quantiles = live(options.seconds, rounds)
+    if options.what in TRANSPORTS:
+        quantiles = live(TRANSPORTS[options.what], options.seconds, rounds)
         if options.json:
             print(json.dumps({"machine": machine(), "seconds": quantiles}, indent=1))
         else:

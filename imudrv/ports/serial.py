@@ -23,7 +23,7 @@ from serial.tools.list_ports import comports
 
 from imudrv.errors import InputError
 from imudrv.hostclock import now_ns
-from imudrv.ports.base import LineErrors, Port, PortLostError, require_transport
+from imudrv.ports.base import OTHER_END_GONE, LineErrors, Port, PortLostError, require_transport
 from imudrv.ports.holders import holders
 from imudrv.profiles.schema import Profile, SerialLine
 from imudrv.records import Arrival, Source
@@ -143,11 +143,16 @@ class DescriptorPort(Port):
         except BlockingIOError:
             return Arrival(now_ns(), b"")
         except OSError as error:
-            raise PortLostError(f"{self.url}: the port is gone: {error.strerror or error}") from error
+            raise self.fault(error.errno or errno.EIO) from error
         t_ns = now_ns()
         if ready and not data:
-            raise PortLostError(f"{self.url}: the other end has gone")
+            raise self.fault(OTHER_END_GONE)
         return Arrival(t_ns, data)
+
+    @property
+    def descriptor(self) -> int | None:
+        """See `Port.descriptor`."""
+        return None if self._closed else self._fd
 
     def line_errors(self) -> LineErrors:
         """See `Port.line_errors`."""

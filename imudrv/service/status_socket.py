@@ -1,6 +1,7 @@
 """Unix socket that reports the status of a running service.
 
-A client connects, receives one line of JSON, and the service closes the connection.
+A client connects, receives one line of JSON, and the service closes the connection. A thread of its own makes
+the line, when a client asks.
 """
 
 import json
@@ -8,8 +9,10 @@ import os
 import socket
 import stat
 import tempfile
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from threading import Thread
 from typing import Any, Final
 
 from imudrv.errors import InputError
@@ -27,12 +30,14 @@ TIMEOUT_S: Final = 2.0
 
 
 class StatusServer:
-    """Unix socket that only its user can open; never blocks.
+    """Unix socket that only its user can open.
 
     Parameters
     ----------
     path : Path
         Path of the socket. One left by a service that has died is replaced.
+    line : callable
+        Returns the status as one line of JSON; called in the thread of the server.
 
     Raises
     ------
@@ -40,8 +45,9 @@ class StatusServer:
         Another service listens there, or the socket cannot be created.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, line: Callable[[], bytes]) -> None:
         self.path = path
+        self._line = line
         if path.exists() and stat.S_ISSOCK(path.stat().st_mode):
             with socket.socket(socket.AF_UNIX) as probe:
                 probe.settimeout(TIMEOUT_S)
@@ -61,31 +67,33 @@ class StatusServer:
         finally:
             os.umask(before)
         self._socket.listen(8)
-        self._socket.setblocking(False)
+        self._is_closing = False
+        self._thread = Thread(target=self._run, name="status", daemon=True)
 
-    def poll(self, line: bytes) -> None:
-        """Send the status to the clients that have connected.
-
-        Parameters
-        ----------
-        line : bytes
-            Status as one line of JSON.
-        """
-        while True:
-            try:
-                client, _ = self._socket.accept()
-            except OSError:
-                return
-            with client, suppress(OSError):
-                # Larger than any status, so that sending never waits for the client.
-                client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MAX_STATUS)
-                client.setblocking(False)
-                client.sendall(line)
+    def start(self) -> None:
+        """Answer clients from now on."""
+        self._thread.start()
 
     def close(self) -> None:
         """Stop listening and remove the socket."""
+        self._is_closing = True
+        if self._thread.is_alive():
+            with socket.socket(socket.AF_UNIX) as waker:
+                waker.connect_ex(os.fspath(self.path))
+            self._thread.join(TIMEOUT_S)
         self._socket.close()
         self.path.unlink(missing_ok=True)
+
+    def _run(self) -> None:
+        while True:
+            client, _ = self._socket.accept()
+            with client, suppress(OSError):
+                if self._is_closing:
+                    return
+                # Larger than any status, so that sending never waits for the client.
+                client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MAX_STATUS)
+                client.setblocking(False)
+                client.sendall(self._line())
 
 
 def ask(path: Path) -> dict[str, Any]:

@@ -65,6 +65,8 @@ class Recorder:
         URL of the port.
     unit : str
         Serial number of the unit; empty if not known.
+    sync_s : float, optional
+        See `imudrv.files.spool.AppendThread`.
 
     Raises
     ------
@@ -82,12 +84,13 @@ class Recorder:
         source: Source,
         port: str,
         unit: str,
+        sync_s: float | None = None,
     ) -> None:
         self._path = path
         self._can = layout.can
         self._wire: _Queue[Arrival] = _Queue(attrgetter("size"))
         self._datagrams: _Queue[bytes] = _Queue(len)
-        self._notes: deque[tuple[int, int, Mapping[str, object]]] = deque(maxlen=1000)
+        self._notes: deque[tuple[int, int, Callable[[], Mapping[str, object]]]] = deque(maxlen=1000)
         self._calibrations: deque[tuple[int, bytes]] = deque(maxlen=10)
         self._put = 0
         self._reported = 0
@@ -96,7 +99,12 @@ class Recorder:
         self._staging = _Staging()
         self._writer = Writer(self._staging, use_chunking=False, use_statistics=False)
         self._begin(profile, calibration, source, port, unit)
-        self._spool = AppendThread(path, self._staging.take(), self._next_piece, self._last_piece)
+        self._spool = AppendThread(path, self._staging.take(), self._next_piece, self._last_piece, sync_s)
+
+    @property
+    def displaced(self) -> str:
+        """What has happened to the file, such as ``deleted``; empty while its name leads to it."""
+        return self._spool.displaced
 
     def arrived(self, arrival: Arrival) -> None:
         """Record a read of the port; call it before the data are used.
@@ -127,15 +135,15 @@ class Recorder:
         self._wire.put(*(moment.arrival for moment in moments))
         self._datagrams.put(*datagrams)
 
-    def status(self, status: Mapping[str, object]) -> None:
+    def status(self, document: Callable[[], Mapping[str, object]]) -> None:
         """Record the state of the service.
 
         Parameters
         ----------
-        status : mapping
-            Values that JSON can represent; it must not change any more.
+        document : callable
+            Returns values that JSON can represent; called in the writing thread.
         """
-        self._notes.append((now_ns(), _STATUS, status))
+        self._notes.append((now_ns(), _STATUS, document))
 
     def event(self, t_ns: int, text: str) -> None:
         """Record an event.
@@ -147,7 +155,7 @@ class Recorder:
         text : str
             What happened.
         """
-        self._notes.append((t_ns, _EVENTS, {"text": text}))
+        self._notes.append((t_ns, _EVENTS, lambda: {"text": text}))
 
     def calibration(self, t_ns: int, calibration: bytes) -> None:
         """Record a new calibration.
@@ -236,7 +244,7 @@ class Recorder:
         with suppress(IndexError):
             while True:
                 t_ns, channel, document = self._notes.popleft()
-                self._message(channel, t_ns, json.dumps(document, default=str).encode())
+                self._message(channel, t_ns, json.dumps(document(), default=str).encode())
         more = max(len(arrivals), len(batches)) == _PIECE
         return Piece(self._staging.take(), len(datagrams) // SIZE, more)
 
