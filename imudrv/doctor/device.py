@@ -2,7 +2,6 @@
 
 import math
 import os
-import resource
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Final
 from imudrv.doctor.verdict import Finding, Verdict
 from imudrv.ports.holders import holders
 from imudrv.ports.permission import RULES_ADVICE, permission_advice
+from imudrv.posix import resource, termios
 from imudrv.service.runtime import PRIORITY
 
 _LOW_LATENCY: Final = 1 << 13  # ASYNC_LOW_LATENCY, linux/tty_flags.h
@@ -36,6 +36,8 @@ class System:
 
 def limits() -> Iterator[Finding]:
     """Check that `--realtime` would be granted to this user: scheduling priority and locked memory."""
+    if resource is None:
+        return
     for name, limit, enough, key, unit in (
         ("real-time priority", resource.RLIMIT_RTPRIO, PRIORITY, "rtprio 50", "LimitRTPRIO=50"),
         ("locked memory", resource.RLIMIT_MEMLOCK, math.inf, "memlock unlimited", "LimitMEMLOCK=infinity"),
@@ -57,7 +59,9 @@ def _user() -> str:
 
 
 def device_steps(device: Path, system: System) -> Iterator[Finding]:
-    """Check the device of a serial port."""
+    """Check the device of a serial port, where a port is a file."""
+    if termios is None:
+        return
     if not device.exists():
         ports = ", ".join(map(str, candidates(system)))
         fix = (

@@ -5,12 +5,10 @@ the lowest latency; other devices are read by pyserial.
 """
 
 import errno
-import fcntl
 import os
 import select
 import socket
 import struct
-import termios
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
@@ -26,6 +24,7 @@ from imudrv.hostclock import now_ns
 from imudrv.ports.base import LineErrors, Port, PortLostError, require_transport
 from imudrv.ports.holders import holders
 from imudrv.ports.permission import permission_advice
+from imudrv.posix import fcntl, termios
 from imudrv.profiles.schema import Profile, SerialLine
 from imudrv.records import Arrival, Source
 from imudrv.url import Url, device_path, host_and_port, serial_settings
@@ -36,6 +35,7 @@ _SLICE_S: Final = 0.02
 _CONNECT_S: Final = 1.0
 _SHOWN_PORTS: Final = 10
 _TIOCGICOUNT: Final = 0x545D  # Linux, asm-generic/ioctls.h
+_OPEN_ERRORS: Final = (OSError,) if termios is None else (OSError, termios.error)
 _COUNTS: Final = struct.Struct("20i")  # struct serial_icounter_struct, linux/serial.h
 
 
@@ -115,6 +115,12 @@ def take_exclusively(descriptor: int) -> None:
         fcntl.ioctl(descriptor, termios.TIOCEXCL)
 
 
+def receiver_of(device: serial.Serial | socket.socket) -> Callable[[int], bytes]:
+    """Return what reads at most a number of bytes that a device has now."""
+    # Only on POSIX systems is a socket a file.
+    return device.recv if isinstance(device, socket.socket) else partial(os.read, device.fileno())
+
+
 class DescriptorPort(Port):
     """Device with a file descriptor; one read of it is one arrival.
 
@@ -132,6 +138,7 @@ class DescriptorPort(Port):
         super().__init__(url, Source.HARDWARE)
         self._device = device
         self._fd = device.fileno()
+        self._receive = receiver_of(device)
         self._closed = False
 
     def read(self, timeout_s: float) -> Arrival:
@@ -140,7 +147,7 @@ class DescriptorPort(Port):
             raise PortLostError(f"{self.url}: the port is closed")
         try:
             ready = select.select([self._fd], (), (), timeout_s)[0]
-            data = os.read(self._fd, _AT_ONCE) if ready else b""
+            data = self._receive(_AT_ONCE) if ready else b""
         except BlockingIOError:
             return Arrival(now_ns(), b"")
         except OSError as error:
@@ -152,7 +159,7 @@ class DescriptorPort(Port):
 
     def line_errors(self) -> LineErrors:
         """See `Port.line_errors`."""
-        if self._closed:
+        if self._closed or fcntl is None:
             return LineErrors()
         try:
             counts = fcntl.ioctl(self._fd, _TIOCGICOUNT, bytes(_COUNTS.size))
@@ -213,12 +220,12 @@ def _open(url: str, target: str, settings: dict[str, Any]) -> Port:
         if isinstance(cause, OSError) and cause.errno != errno.EINVAL:  # unplugged while its speed was set
             raise PortLostError(f"{url}: {explain(target, cause)}") from error
         raise InputError(f"{url}: {error}") from error
-    except (OSError, termios.error) as error:
+    except _OPEN_ERRORS as error:
         if "expected a string in the form" in str(error):
             raise InputError(f"{url}: {error}") from error
         reason = error if isinstance(error, OSError) else OSError(*error.args)
         raise PortLostError(f"{url}: {explain(target, reason)}") from error
-    if not isinstance(device, serial.Serial) or target.startswith("spy:"):
+    if termios is None or not isinstance(device, serial.Serial) or target.startswith("spy:"):
         return PyserialPort(url, device)
     if not Path(target).resolve().is_relative_to("/dev/pts"):  # the other end of a pty keeps the flag alive
         take_exclusively(device.fileno())
@@ -241,7 +248,7 @@ def _connect(url: str, address: tuple[str, int]) -> Port:
 
 def _device(url: Url) -> str:
     device = Path(device_path(url))
-    if device.exists() and not device.is_char_device():
+    if termios is not None and device.exists() and not device.is_char_device():
         kind = "folder" if device.is_dir() else "file"
         raise InputError(
             f"{url.text}: expected a serial device, got a {kind}; a capture is read with "

@@ -13,7 +13,7 @@ from contextlib import ExitStack
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from signal import SIGHUP, SIGINT, SIGTERM
+from signal import SIGINT, SIGTERM
 from typing import Final
 
 import numpy as np
@@ -24,6 +24,7 @@ from imudrv.diagnosis import LineState
 from imudrv.hostclock import now_ns
 from imudrv.pipeline import Pipeline, PipelineOutput
 from imudrv.ports import PortEndedError
+from imudrv.posix import SIGHUP
 from imudrv.records import INCREMENTS, PULSES, Arrival, Flag, Source
 from imudrv.service.calibration_watch import CalibrationWatch
 from imudrv.service.clock_watch import ClockWatch

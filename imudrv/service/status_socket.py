@@ -1,18 +1,16 @@
-"""Unix socket that reports the status of a running service.
+"""Report the status of a running service to those who ask.
 
 A client connects, receives one line of JSON, and the service closes the connection.
 """
 
 import json
-import os
 import socket
-import stat
-import tempfile
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
 from imudrv.errors import InputError
+from imudrv.service.endpoint import Endpoint, connect, default_folder
 
 FORMAT: Final = "imu50-status"
 VERSION: Final = 1
@@ -27,40 +25,23 @@ TIMEOUT_S: Final = 2.0
 
 
 class StatusServer:
-    """Unix socket that only its user can open; never blocks.
+    """Answers with the status at a path; never blocks.
 
     Parameters
     ----------
     path : Path
-        Path of the socket. One left by a service that has died is replaced.
+        See `Endpoint`.
 
     Raises
     ------
     InputError
-        Another service listens there, or the socket cannot be created.
+        See `Endpoint`.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        if path.exists() and stat.S_ISSOCK(path.stat().st_mode):
-            with socket.socket(socket.AF_UNIX) as probe:
-                probe.settimeout(TIMEOUT_S)
-                if probe.connect_ex(os.fspath(path)) == 0:
-                    raise InputError(
-                        f"{path}: expected no other service, got one that answers; "
-                        "stop it, or give --status another path"
-                    )
-            path.unlink()
-        self._socket = socket.socket(socket.AF_UNIX)
-        before = os.umask(0o177)
-        try:
-            self._socket.bind(os.fspath(path))
-        except OSError as error:
-            self._socket.close()
-            raise InputError(f"{path}: cannot create the status socket: {error.strerror or error}") from error
-        finally:
-            os.umask(before)
-        self._socket.listen(8)
+        self._endpoint = Endpoint(path)
+        self._socket = self._endpoint.listener
         self._socket.setblocking(False)
 
     def poll(self, line: bytes) -> None:
@@ -84,8 +65,7 @@ class StatusServer:
 
     def close(self) -> None:
         """Stop listening and remove the socket."""
-        self._socket.close()
-        self.path.unlink(missing_ok=True)
+        self._endpoint.close()
 
 
 def ask(path: Path) -> dict[str, Any]:
@@ -108,9 +88,7 @@ def ask(path: Path) -> dict[str, Any]:
     """
     data = bytearray()
     try:
-        with socket.socket(socket.AF_UNIX) as channel:
-            channel.settimeout(TIMEOUT_S)
-            channel.connect(os.fspath(path))
+        with connect(path, TIMEOUT_S) as channel:
             while len(data) <= MAX_STATUS and (piece := channel.recv(1 << 16)):
                 data += piece
     except OSError as error:
@@ -128,5 +106,5 @@ def ask(path: Path) -> dict[str, Any]:
 
 
 def default_status_path() -> Path:
-    """Return the default path of the status socket: in the user's runtime folder."""
-    return Path(os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()) / "imu50.sock"
+    """Return the default path of the status socket; see `imudrv.service.endpoint.default_folder`."""
+    return default_folder() / "imu50.sock"
