@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from imudrv.errors import InputError
+from imudrv.files.atomic import change_mark
 from imudrv.files.lock import FileLock
 from imudrv.url import LOOPBACK
 
@@ -54,7 +55,7 @@ class Endpoint:
                 undo.callback(self._lock.remove)
                 _unlink_left_over(path)
                 self.listener = undo.enter_context(_listen(path))
-                self._own = path.lstat()
+                self._own = change_mark(path)
             except BlockingIOError as error:
                 raise InputError(
                     f"{path}: expected no other service, got one that runs; stop it, or {_ADVICE}"
@@ -68,7 +69,7 @@ class Endpoint:
     def close(self) -> None:
         """Stop listening; remove the socket, unless another one has its path meanwhile."""
         with self._close, suppress(OSError):
-            if os.path.samestat(self.path.lstat(), self._own):
+            if change_mark(self.path) == self._own:
                 self.path.unlink()
 
 
@@ -162,11 +163,11 @@ def _lock_path(path: Path) -> Path:
 
 def _unlink_left_over(path: Path) -> None:
     """Remove the socket at a path whose lock is held; raise OSError for anything else that is there."""
+    if not os.path.lexists(path):
+        return
     try:
         if not stat.S_ISSOCK(path.lstat().st_mode):
             _port(path)
-    except FileNotFoundError:
-        return
     except OSError as error:
         raise OSError("there is a file or folder that is no socket") from error
     path.unlink()
