@@ -7,9 +7,11 @@ from types import FrameType
 
 
 @contextmanager
-def handled(handler: Callable[[int, FrameType | None], object], *numbers: signal.Signals) -> Iterator[None]:
-    """Handle signals within the context; the handlers from before it come back."""
-    before = {number: signal.signal(number, handler) for number in numbers}
+def handled(
+    handler: Callable[[int, FrameType | None], object], *numbers: signal.Signals | None
+) -> Iterator[None]:
+    """Handle signals within the context; the handlers from before it come back. None: not on this system."""
+    before = {number: signal.signal(number, handler) for number in numbers if number is not None}
     try:
         yield
     finally:

@@ -21,6 +21,7 @@ from typing import Any, Final, NamedTuple, TypeAlias
 from calib.bench.entries import Entry, LineDropped, Plan, from_json, to_json
 from imudrv.errors import InputError
 from imudrv.files.atomic import sync_folder
+from imudrv.posix import O_BINARY
 
 _Line: TypeAlias = dict[str, Any]
 
@@ -95,7 +96,7 @@ class Journal:
         self._entries, self._last, partial = read(path)
         self.dropped = ""
         try:
-            self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC)
+            self._file = os.open(path, os.O_WRONLY | os.O_APPEND | O_BINARY)
         except OSError as error:
             raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
         if partial is not None:

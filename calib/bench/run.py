@@ -1,13 +1,12 @@
 """`calib run`: a session from the command line, with a unit or a rehearsal."""
 
 import os
-import tempfile
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from signal import SIGHUP, SIGINT, SIGTERM
+from signal import SIGINT, SIGTERM
 from threading import Thread
 from typing import Final
 
@@ -30,6 +29,8 @@ from imudrv.calibration import coefficients, read_calibration
 from imudrv.errors import InputError
 from imudrv.files import settings_file
 from imudrv.imu.compensation import require_sensors
+from imudrv.posix import SIGHUP
+from imudrv.service.endpoint import default_folder
 from imudrv.service.loop import Service
 from imudrv.service.runtime import SignalFlags
 from imudrv.service.settings import Settings
@@ -149,11 +150,11 @@ def conduct(session: Session, options: RunOptions, console: Console) -> int:
     queue = QueueSink(QUEUE_LIMIT if simulated is not None and simulated.waits else None)
     layout = profiles.load(plan.profile.name).layout()
     settings = Settings(
-        port=options.port or plan.port,
+        port=options.port or (plan.port if simulated is None else simulated.port),
         profile=plan.profile.name,
         calibration=str(session.folder / WORKING_CERTIFICATE),
         unit=plan.unit,
-        status=str(Path(tempfile.gettempdir()) / f"imu50-calib-{os.getpid()}.sock"),
+        status=str(default_folder() / f"imu50-calib-{os.getpid()}.sock"),
     )
     signals = SignalFlags()
     service = Service(

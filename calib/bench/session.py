@@ -13,7 +13,6 @@ files are recorded there and its recording has been decoded and found to cover t
 result can therefore always be computed again from the files.
 """
 
-import fcntl
 import hashlib
 import os
 from collections.abc import Sequence
@@ -38,6 +37,7 @@ from imudrv import profiles
 from imudrv.calibration import Calibration, read_calibration, read_calibration_file, write_calibration
 from imudrv.errors import InputError
 from imudrv.files.atomic import sync_folder
+from imudrv.files.lock import FileLock
 
 
 class Session(SessionState):
@@ -53,7 +53,7 @@ class Session(SessionState):
         Message about a partial line that was dropped from the journal; empty if there was none.
     """
 
-    def __init__(self, folder: Path, lock: int) -> None:
+    def __init__(self, folder: Path, lock: FileLock) -> None:
         self._lock = lock
         self._journal = Journal(folder / JOURNAL)
         super().__init__(folder, self._journal.entries)
@@ -124,7 +124,7 @@ class Session(SessionState):
             journal.begin(folder / JOURNAL, plan)
             return cls(folder, lock)
         except BaseException:
-            os.close(lock)
+            lock.release()
             raise
 
     @classmethod
@@ -152,7 +152,7 @@ class Session(SessionState):
         try:
             return cls(folder, lock)
         except BaseException:
-            os.close(lock)
+            lock.release()
             raise
 
     def append(self, entry: Entry) -> None:
@@ -227,15 +227,12 @@ class Session(SessionState):
     def close(self) -> None:
         """Close the journal and release the lock."""
         self._journal.close()
-        os.close(self._lock)
+        self._lock.release()
 
 
-def _locked(folder: Path) -> int:
+def _locked(folder: Path) -> FileLock:
     """Take the folder's lock, which ends with the process."""
-    lock = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        os.close(lock)
+        return FileLock(folder / LOCK)
+    except BlockingIOError:
         raise InputError(f"{folder}: another process has this session open; end it first") from None
-    return lock

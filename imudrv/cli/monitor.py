@@ -9,7 +9,7 @@ from rich.console import Console
 from imudrv.service.monitor import monitor
 from imudrv.service.status_socket import default_status_path
 
-EXAMPLE: Final = "--status /tmp/imu50.sock"
+EXAMPLE: Final = "--status /run/imu50/imu50.sock"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

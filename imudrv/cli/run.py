@@ -3,11 +3,11 @@
 import argparse
 import sys
 from pathlib import Path
-from signal import SIGHUP
 from typing import Final
 
 from imudrv.cli.arguments import add_profile
 from imudrv.imu.rate_filter import NAMES
+from imudrv.posix import SIGHUP
 from imudrv.service import settings
 from imudrv.service.loop import Service
 from imudrv.service.printer import Printer

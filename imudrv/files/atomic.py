@@ -172,7 +172,7 @@ def atomic_write(path: Path) -> Iterator[IO[bytes]]:
 
 
 def sync_folder(folder: Path) -> None:
-    """Wait until the names in a folder are on the disk.
+    """Wait until the names in a folder are on the disk, where the system can.
 
     Parameters
     ----------
@@ -182,8 +182,10 @@ def sync_folder(folder: Path) -> None:
     Raises
     ------
     OSError
-        The system cannot do it.
+        The folder cannot be read.
     """
+    if not hasattr(os, "O_DIRECTORY"):  # Windows opens no folder
+        return
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)

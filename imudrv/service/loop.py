@@ -18,7 +18,7 @@ from functools import cache
 from importlib.metadata import version
 from itertools import islice
 from pathlib import Path
-from signal import SIGHUP, SIGINT, SIGTERM
+from signal import SIGINT, SIGTERM
 from typing import Final
 
 import numpy as np
@@ -29,6 +29,7 @@ from imudrv.chain import Chain, Output
 from imudrv.diagnosis import LineState
 from imudrv.hostclock import now_ns
 from imudrv.ports import PortEndedError
+from imudrv.posix import SIGHUP
 from imudrv.records import INCREMENTS, PULSES, Arrival, Source
 from imudrv.service.calibration_watch import CalibrationWatch
 from imudrv.service.clock_watch import ClockWatch
