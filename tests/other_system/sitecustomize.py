@@ -57,6 +57,13 @@ def _open_file(path, flags, mode=0o777, **more):
     return _open(path, flags, mode, **more)
 
 
+def _socketpair():
+    """Do as `socket.socketpair` does there: connect over the loopback."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        one = socket.create_connection(server.getsockname())
+        return one, server.accept()[0]
+
+
 def _locking(file, mode, size):
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -70,7 +77,7 @@ for module, names in NAMES.items():
 for name in MODULES:
     sys.modules.pop(name, None)
 sys.meta_path.insert(0, Absent)
-select.select, os.open = _select_sockets, _open_file
+select.select, os.open, socket.socketpair = _select_sockets, _open_file, _socketpair
 os.read = lambda file, size: _read(_no_socket(file), size)
 os.write = lambda file, data: _write(_no_socket(file), data)
 sys.modules["msvcrt"] = msvcrt = ModuleType("msvcrt")
