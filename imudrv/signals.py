@@ -7,7 +7,7 @@ from types import FrameType
 from typing import Final
 
 SIGHUP: Final[signal.Signals | None] = getattr(signal, "SIGHUP", None)
-"""The terminal was closed, or the calibration is to be read again; None on Windows, which has no such signal."""
+"""The terminal was closed, or the calibration is to be read again; None on Windows, which lacks it."""
 
 
 @contextmanager
