@@ -96,7 +96,8 @@ def _say(reason: str) -> None:
     global _said
     if sys.stderr is not None and not _said:
         _said = True
-        sys.stderr.write(
-            f"compiled kernels cannot be kept ({reason}), so each start takes longer; "
-            "set XDG_CACHE_HOME to a folder that can be written to\n"
-        )
+        with suppress(OSError):
+            sys.stderr.write(
+                f"compiled kernels cannot be kept ({reason}), so each start takes longer; "
+                "set XDG_CACHE_HOME to a folder that can be written to\n"
+            )

@@ -1,7 +1,6 @@
-"""What POSIX systems have and Windows has not: modules are None there, constants None or 0."""
+"""What POSIX systems have and Windows has not: modules are None there."""
 
 import os
-import signal
 import sys
 from importlib import import_module
 from typing import Any, Final
@@ -20,8 +19,6 @@ fcntl: Final = _module("fcntl")
 resource: Final = _module("resource")
 termios: Final = _module("termios")
 tty: Final = _module("tty")
-
-SIGHUP: Final[signal.Signals | None] = getattr(signal, "SIGHUP", None)
 
 O_BINARY: Final[int] = getattr(os, "O_BINARY", 0)
 """Flag for `os.open` of a file that is not text; 0 where all files are alike."""

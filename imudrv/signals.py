@@ -4,6 +4,10 @@ import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import Final
+
+SIGHUP: Final[signal.Signals | None] = getattr(signal, "SIGHUP", None)
+"""The terminal was closed, or the calibration is to be read again; None on Windows, which lacks it."""
 
 
 @contextmanager

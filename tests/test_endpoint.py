@@ -143,10 +143,7 @@ def test_a_socket_left_by_another_user_is_reported(everyones: Path, has_lock: bo
     assert "ermi" in done.stderr.rpartition("status: ")[2]  # permission denied, operation not permitted
 
 
-def test_sockets_of_killed_sessions_are_removed_and_those_of_live_ones_stay(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+def test_sockets_of_killed_sessions_are_removed_and_those_of_live_ones_stay(tmp_path: Path) -> None:
     (tmp_path / "bus").write_text("of another program")
     kill(owner(tmp_path / "imu50-calib-4711.sock"))
     live = owner(tmp_path / "imu50-calib-4712.sock")

@@ -29,11 +29,11 @@ from imudrv.calibration import coefficients, read_calibration
 from imudrv.errors import InputError
 from imudrv.files import settings_file
 from imudrv.imu.compensation import require_sensors
-from imudrv.posix import SIGHUP
 from imudrv.service.endpoint import default_folder
 from imudrv.service.loop import Service
 from imudrv.service.runtime import SignalFlags
 from imudrv.service.settings import Settings
+from imudrv.signals import SIGHUP
 from imudrv.sinks.history import History
 from imudrv.site import Site
 from imudrv.terminal import INTERRUPTED, OK

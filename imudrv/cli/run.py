@@ -7,12 +7,12 @@ from typing import Final
 
 from imudrv.cli.arguments import add_profile
 from imudrv.imu.rate_filter import NAMES
-from imudrv.posix import SIGHUP
 from imudrv.service import settings
 from imudrv.service.loop import Service
 from imudrv.service.printer import Printer
 from imudrv.service.runtime import SignalFlags
 from imudrv.service.settings import Settings
+from imudrv.signals import SIGHUP
 from imudrv.terminal import INTERRUPTED, OK
 
 EXAMPLE: Final = (

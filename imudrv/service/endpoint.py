@@ -47,8 +47,7 @@ class Endpoint:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        if path.parent == default_folder():
-            _remove_left_over(path.parent)
+        _remove_left_over(path.parent)
         with ExitStack() as undo:
             try:
                 self._lock = FileLock(_lock_path(path))

@@ -29,7 +29,6 @@ from imudrv.chain import Chain, Output
 from imudrv.diagnosis import LineState
 from imudrv.hostclock import now_ns
 from imudrv.ports import PortEndedError
-from imudrv.posix import SIGHUP
 from imudrv.records import INCREMENTS, PULSES, Arrival, Source
 from imudrv.service.calibration_watch import CalibrationWatch
 from imudrv.service.clock_watch import ClockWatch
@@ -50,6 +49,7 @@ from imudrv.service.status import (
 )
 from imudrv.service.status_socket import StatusServer, default_status_path
 from imudrv.service.warm_up import warm_up
+from imudrv.signals import SIGHUP
 from imudrv.sinks import open_sink
 from imudrv.sinks.base import Batch, Sink
 from imudrv.sinks.history import History

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from typing import Final
 
-from imudrv.posix import SIGHUP, resource
-from imudrv.signals import handled
+from imudrv.posix import resource
+from imudrv.signals import SIGHUP, handled
 
 PRIORITY: Final = 40
 """SCHED_FIFO priority: above ordinary work, below the kernel's interrupt threads (50)."""
