@@ -13,10 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imudrv.kernels import kernel
-from imudrv.wire.layout import MAX_RANGES, Check, CheckKind
-
-MAX_AROUND: Final = 32
-"""Most bytes before and behind a message that a check covers and that are not sent."""
+from imudrv.wire.layout import MAX_AROUND, MAX_RANGES, Check, CheckKind
 
 CHECK: Final = np.dtype(
     [

@@ -19,6 +19,8 @@ MAX_MESSAGES: Final = 16
 """Kinds of message that a profile may have."""
 MAX_RANGES: Final = 4
 """Ranges of bytes that a check may cover."""
+MAX_AROUND: Final = 32
+"""Most bytes before and behind a message that a check covers and that are not sent."""
 NARROW_BITS: Final = 12
 """A counter of fewer bits, or a time of fewer samples, wraps within seconds: what it says about a gap depends
 on the time of arrival."""
