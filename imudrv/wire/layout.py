@@ -7,6 +7,10 @@ from functools import cached_property
 from itertools import takewhile
 from typing import Final, NamedTuple
 
+import numpy as np
+
+from imudrv.records import samples_type
+
 SEQUENCE: Final = 0
 GYRO: Final = 1
 ACCELEROMETER: Final = 4
@@ -359,6 +363,13 @@ class Layout:
     def sensors(self) -> tuple[Sensor, Sensor]:
         """Gyros and accelerometers."""
         return self.gyro, self.accelerometer
+
+    @property
+    def samples_type(self) -> np.dtype[np.void]:
+        """Type of the unit's samples, see `imudrv.records.samples_type`."""
+        return samples_type(
+            gyro_pulses=self.gyro.is_counted, accelerometer_pulses=self.accelerometer.is_counted
+        )
 
     @property
     def missing_axes(self) -> tuple[list[int], list[int]]:
