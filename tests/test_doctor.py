@@ -26,6 +26,7 @@ from imudrv.errors import InputError
 from imudrv.files.settings_file import parse
 from imudrv.ports import Arrival, Port, PortEndedError
 from imudrv.ports.base import LineErrors
+from imudrv.ports.permission import permission_advice
 from imudrv.profiles.line_load import line_load
 from imudrv.profiles.schema import Profile, SerialLine
 from imudrv.records import MESSAGE, Reason, Source, samples_type
@@ -302,13 +303,13 @@ def test_for_a_device_that_does_not_exist_those_that_do_are_named(system: System
     assert [step.name for step in rest] == ["line load", "real-time priority", "locked memory"]
 
 
-def test_for_a_device_without_permission_the_group_is_named(
+def test_for_a_device_without_permission_the_way_to_it_is_named(
     line: tuple[int, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "access", lambda *_: False)
     steps = by_name(examine(line[1], "imu50-rs422", 0.1))
     assert steps["permission"].verdict is Verdict.FAIL
-    assert f"sudo usermod -aG {Path(line[1]).group()} " in steps["permission"].fix
+    assert steps["permission"].fix == permission_advice(Path(line[1]))
     assert "99-imu50.rules" in steps["permission"].fix
     assert "open" not in steps
 

@@ -25,6 +25,7 @@ from imudrv.errors import InputError
 from imudrv.hostclock import now_ns
 from imudrv.ports.base import LineErrors, Port, PortLostError, require_transport
 from imudrv.ports.holders import holders
+from imudrv.ports.permission import permission_advice
 from imudrv.profiles.schema import Profile, SerialLine
 from imudrv.records import Arrival, Source
 from imudrv.url import Url, device_path, host_and_port, serial_settings
@@ -91,7 +92,7 @@ def explain(device: str, error: OSError) -> str:
         case errno.ENOENT | errno.ENODEV | errno.ENXIO:
             return f"there is no {device}; {_ports_there_are()}"
         case errno.EACCES | errno.EPERM:
-            return f"no permission for {device}; {_who_may(device)}"
+            return f"no permission for {device}; {permission_advice(Path(device))}"
         case errno.EBUSY | errno.EAGAIN:
             users, _ = holders(Path(device).resolve())
             who = ", ".join(users) or f"another program (`sudo fuser -v {device}` names it)"
@@ -261,11 +262,3 @@ def _ports_there_are() -> str:
         return "there is no serial port: is it plugged in?"
     more = ", ..." if len(names) > _SHOWN_PORTS else ""
     return f"there are {', '.join(names[:_SHOWN_PORTS])}{more}"
-
-
-def _who_may(device: str) -> str:
-    try:
-        group = Path(device).group()
-    except (OSError, KeyError):
-        return "run as a user with permission"
-    return f"its group is {group}: `sudo usermod -aG {group} $USER`, then log in again, or add a udev rule"
