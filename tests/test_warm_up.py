@@ -91,9 +91,9 @@ samples["counter"] = np.arange(400) * layout.counter_step
 samples["arrival_ns"] = np.arange(400) * layout.interval_ns
 wire = CanEncoder(layout).encode(samples)
 calibration = nominal(layout)
-warm_up(profile, calibration, "dither", False)
+warm_up(profile, calibration, "causal", False)
 before = signatures()
-chain = Chain(profile, coefficients(calibration), "dither")
+chain = Chain(profile, coefficients(calibration), "causal")
 chain.feed(wire[:200], 0)
 chain.replace_calibration(coefficients(calibration))
 chain.feed(wire[200:], 0)
