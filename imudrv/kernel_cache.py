@@ -4,8 +4,8 @@ numba's own cache ends a command at a file that a power failure has cut short, a
 one never fails: a kernel that cannot be loaded is compiled; one that cannot be stored is compiled at each
 start.
 
-It is the only module that uses internals of numba: what `Dispatcher` asks of its cache, and how a compiled
-function becomes bytes and is one again.
+It is the only module that uses internals of numba: what `Dispatcher` asks of its cache, how a compiled
+function becomes bytes and is one again, and how the type of a call from another kernel is found.
 """
 
 import hashlib
@@ -20,14 +20,20 @@ from typing import Any, Final
 import numba
 from numba.core.compiler import CompileResult
 from numba.core.serialize import dumps
+from numba.core.types import unliteral
+
+from imudrv.compilation import missed_a_kernel
 
 _to_bytes: Final[Callable[[Any], bytes]] = dumps
+
+_unliteral: Final[Callable[[Any], Any]] = unliteral
 
 _from_parts: Final[Callable[..., Any]] = CompileResult._rebuild  # noqa: SLF001
 
 _DIGEST: Final = hashlib.sha256().digest_size
 
-_said = False
+refused = False
+"""Whether a kernel could not be kept."""
 
 
 def keep_compiled(dispatcher: Any, folder: Path | None) -> None:
@@ -43,6 +49,22 @@ def keep_compiled(dispatcher: Any, folder: Path | None) -> None:
     dispatcher._cache = _KernelCache(dispatcher.py_func, folder)  # noqa: SLF001
 
 
+def take_literals_as_variables(dispatcher: Any) -> None:
+    """Compile a function once for all constants with which other ones call it.
+
+    Parameters
+    ----------
+    dispatcher : Dispatcher
+        Function declared with `numba.njit`.
+    """
+    template = dispatcher.get_call_template
+
+    def get_call_template(args: Any, kws: Any) -> Any:
+        return template([_unliteral(a) for a in args], {name: _unliteral(a) for name, a in kws.items()})
+
+    dispatcher.get_call_template = get_call_template
+
+
 class _KernelCache:
     """The cache of one kernel: a file for each signature, that begins with the SHA-256 of the rest."""
 
@@ -56,8 +78,14 @@ class _KernelCache:
         target.refresh()
         if self._folder is None:
             return None
+        compiled = self._load(self._folder, signature, target)
+        if compiled is None and missed_a_kernel(self._folder):
+            compiled = self._load(self._folder, signature, target)
+        return compiled
+
+    def _load(self, folder: Path, signature: Any, target: Any) -> Any:
         with suppress(Exception):  # whatever is wrong with the file, the kernel is compiled
-            data = self._file(self._folder, signature, target.codegen()).read_bytes()
+            data = self._file(folder, signature, target.codegen()).read_bytes()
             if hashlib.sha256(data[_DIGEST:]).digest() == data[:_DIGEST]:
                 return _from_parts(target, *pickle.loads(data[_DIGEST:]))
         return None
@@ -93,9 +121,9 @@ class _KernelCache:
 
 
 def _say(reason: str) -> None:
-    global _said
-    if sys.stderr is not None and not _said:
-        _said = True
+    global refused
+    before, refused = refused, True
+    if sys.stderr is not None and not before:
         with suppress(OSError):
             sys.stderr.write(
                 f"compiled kernels cannot be kept ({reason}), so each start takes longer; "

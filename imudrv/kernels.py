@@ -13,7 +13,7 @@ from typing import Any, Final, TypeVar, cast
 from numba import njit
 from numba.core import config
 
-from imudrv.kernel_cache import keep_compiled
+from imudrv.kernel_cache import keep_compiled, take_literals_as_variables
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -42,7 +42,8 @@ def _cache_folder() -> Path | None:
     return Path(home) / "imu50" / f"kernels-{digest.hexdigest()[:16]}"
 
 
-_FOLDER = _cache_folder()
+FOLDER: Final = _cache_folder()
+"""Folder of compiled kernels; None for a user without a home."""
 
 
 def kernel(function: F) -> F:
@@ -61,5 +62,6 @@ def kernel(function: F) -> F:
     compiled = njit(nogil=True, error_model="numpy", forceinline=True)(function)
     settings: Any = config  # numba makes its settings' names at run time
     if not settings.DISABLE_JIT:
-        keep_compiled(compiled, _FOLDER)
+        keep_compiled(compiled, FOLDER)
+        take_literals_as_variables(compiled)
     return cast(F, compiled)

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from importlib import import_module
 from importlib.metadata import version
 
+from imudrv.compilation import compile_all_at_first_miss
 from imudrv.errors import InputError
 
 OK, OUR_FAULT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -58,6 +59,7 @@ def _run(package: str, description: str, commands: Mapping[str, str], arguments:
             subparser.epilog = f"example: {program} {command} {module.EXAMPLE}".rstrip()
             module.add_arguments(subparser)
     parsed = parser.parse_args(arguments)
+    compile_all_at_first_miss()
     code: int | None = module.run(parsed) if module else None
     return code
 

@@ -362,6 +362,21 @@ def test_help_version_and_status_load_no_numerical_library(
     assert not loaded & HEAVY
 
 
+@pytest.mark.parametrize("kind", ["calibration", "site", "profile", "scenario"])
+def test_a_file_is_checked_without_a_compiler(bench: Path, kind: str) -> None:
+    files = {
+        "calibration": bench / "unit.yaml",
+        "site": bench / "site.yaml",
+        "profile": ROOT / "imudrv" / "profiles" / "imu50-can.yaml",
+        "scenario": bench / "run.yaml",
+    }
+    files["site"].write_text("{format: imu50-site, latitude_deg: 28.2, longitude_deg: 113.0, height_m: 60.0}")
+    command = [sys.executable, "-X", "importtime", "-m", "imudrv", "check", str(files[kind])]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "valid" in done.stdout
+    assert not re.findall(r"\| +(numba|llvmlite|scipy)$", done.stderr, re.MULTILINE)
+
+
 @pytest.mark.parametrize(
     ("main", "commands"), [(main, cli.COMMANDS), (calib.main, calib.COMMANDS)], ids=["imudrv", "calib"]
 )

@@ -15,6 +15,7 @@ PYTHON = """\
 #!/bin/sh
 # `-m venv DIR` copies this script to DIR/bin/python; `-m pip ... -e TOP[dev]` makes the program `where`,
 # which prints TOP. As with pip, the program's first line has an absolute path of the environment.
+# `-m imudrv warm` fails, as it does where kernels cannot be kept.
 for last in "$@"; do :; done
 bin=$(dirname "$0")
 case "$2" in
@@ -27,9 +28,12 @@ pip)
     top=${last%?dev?}
     printf '#!%s/.venv/bin/sh\\necho %s\\n' "$top" "$top" >"$bin/where"
     chmod +x "$bin/where" ;;
+imudrv)
+    [ "$3" = warm ] && echo compiling >&2
+    exit 2 ;;
 esac
 """
-INSTALLING = "tools/run: installing into .venv (once, a minute or two)\n"
+INSTALLING = "tools/run: installing into .venv (once, a minute or two)\ncompiling\n"
 
 
 @pytest.fixture

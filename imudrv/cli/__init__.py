@@ -22,6 +22,7 @@ COMMANDS: Final = {
     "profiles": "List the shipped profiles, print one, or begin one from a DBC file.",
     "files": "Write the files for C programs, udev and systemd to a folder.",
     "check": "Check a calibration, site, profile, scenario or settings file.",
+    "warm": "Compile all kernels ahead of the first start.",
 }
 
 

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Final
 
 from imudrv.calibration import Calibration
-from imudrv.diagnosis import line_load
 from imudrv.errors import FaultyFileError, InputError
 from imudrv.files import settings_file
 from imudrv.files.model import Model
+from imudrv.profiles.line_load import line_load
 from imudrv.profiles.schema import CanLine, Profile
 from imudrv.profiles.summary import line, summary
 from imudrv.service.settings import Settings

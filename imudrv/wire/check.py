@@ -13,10 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imudrv.kernels import kernel
-from imudrv.wire.layout import MAX_RANGES, Check, CheckKind
-
-MAX_AROUND: Final = 32
-"""Most bytes before and behind a message that a check covers and that are not sent."""
+from imudrv.wire.layout import MAX_AROUND, MAX_RANGES, Check, CheckKind
 
 CHECK: Final = np.dtype(
     [
@@ -66,7 +63,7 @@ def check_table(check: Check) -> np.void:
     table["after"] = len(check.suffix)
     table["suffix"][: len(check.suffix)] = list(check.suffix)
     table["crc_table"] = _crc_table(check)
-    prefix = np.frombuffer(check.prefix, np.uint8)
+    prefix = np.array(list(check.prefix), np.uint8)
     table["init"], table["second"] = _absorb(prefix, 0, prefix.size, table, _register(check), 0)
     return table
 
