@@ -113,7 +113,7 @@ def live_bytes() -> None:
 
 def live_messages() -> None:
     """All stages in one, for CAN messages."""
-    warm_up(_MESSAGES, nominal(_MESSAGES.layout()), "causal", False)
+    warm_up(_MESSAGES, nominal(_MESSAGES.layout()), "causal", system.IS_AVAILABLE)
 
 
 def logs() -> None:

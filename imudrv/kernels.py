@@ -19,6 +19,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 CONSTANTS: Final = (
     "arrays.py",
+    "ports/base.py",
     "records.py",
     "units.py",
     "service/clock_watch.py",

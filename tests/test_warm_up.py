@@ -114,7 +114,7 @@ def run(*arguments: object, cwd: Path, **environment: str) -> subprocess.Complet
     )
 
 
-@pytest.mark.parametrize("profile", ["imu50-rs422", "kvh1775"])
+@pytest.mark.parametrize("profile", ["imu50-rs422", "kvh1775", "hg4930"])
 def test_once_the_unit_is_connected_the_service_loads_no_kernel(profile: str, tmp_path: Path) -> None:
     certificate = CERTIFICATE
     if profile != "imu50-rs422":  # it does not send pulses
