@@ -18,6 +18,7 @@ from typing import Final
 
 PARTS: Final = (
     "frames",
+    "other_frames",
     "samples",
     "compensation",
     "messages",
@@ -26,6 +27,7 @@ PARTS: Final = (
     "encoding",
     "navigation",
     "live_bytes",
+    "live_other_bytes",
     "live_messages",
     "logs",
     "recordings",

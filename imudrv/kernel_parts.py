@@ -1,7 +1,7 @@
 """The kernels that the programs call, in parts: each function calls some of them with next to no data.
 
-Run by the processes that `imudrv.compilation` starts. All profiles share these kernels: what distinguishes
-them is in arrays. A part that needs another one's kernels finds those compiled.
+Run by the processes that `imudrv.compilation` starts. All profiles share these kernels, what distinguishes them
+is in arrays; only streams of several kinds of message have a decoder of their own. A part that needs another one's kernels finds those compiled.
 """
 
 import os
@@ -38,6 +38,7 @@ from imudrv.wire.stream import StreamDecoder
 _events: Any = event  # has no type hints
 
 _BYTES: Final = profiles.load("imu50-rs422")
+_KINDS: Final = profiles.load("hg4930")
 _MESSAGES: Final = profiles.load("imu50-can")
 _LEVEL: Final = (1.0, 0.0, 0.0, 0.0)
 _SCENARIO: Final = {
@@ -55,6 +56,11 @@ _SCENARIO: Final = {
 def frames() -> None:
     """Frames from bytes."""
     StreamDecoder(_BYTES.layout()).feed(b"\0")
+
+
+def other_frames() -> None:
+    """Frames from bytes, of messages of several kinds."""
+    StreamDecoder(_KINDS.layout()).feed(b"\0")
 
 
 def samples() -> None:
@@ -109,6 +115,11 @@ def navigation() -> None:
 def live_bytes() -> None:
     """All stages in one, for bytes, and the loop that serves a descriptor."""
     warm_up(_BYTES, nominal(_BYTES.layout()), "causal", system.IS_AVAILABLE)
+
+
+def live_other_bytes() -> None:
+    """The same for messages of several kinds."""
+    warm_up(_KINDS, nominal(_KINDS.layout()), "causal", system.IS_AVAILABLE)
 
 
 def live_messages() -> None:

@@ -173,7 +173,7 @@ def test_after_the_warm_up_no_command_compiles_a_kernel(cache: Path, tmp_path: P
         "--record can.mcap --status status",
         "imudrv decode z.mcap -o mcap.npz",
         "imudrv decode can.mcap -o can.npz",
-        "imudrv export z.mcap -o z.imr",
+        "imudrv export z.mcap --to imr -o z.imr",
         "calib identify x.raw y.raw z.raw --profile imu50-rs422 --calibration unit.yaml --site site.yaml "
         "-o new.yaml",
         "calib run --rehearse --speed max --session session",
@@ -210,7 +210,7 @@ def test_the_first_command_has_all_kernels_compiled_and_says_so_on_the_terminal(
     os.close(terminal)
     assert process.returncode == 0
     assert said.startswith(b"\r" + NOTE.encode())
-    assert b": 13 of 13 parts" in said
+    assert b": 15 of 15 parts" in said
     assert said.endswith(b"\r\x1b[K")
     again = run(*command[:-1], "b.csv", cwd=tmp_path, NUMBA_CACHE_DIR=str(tmp_path))
     assert (again.returncode, again.stderr) == (0, "")
