@@ -1,7 +1,8 @@
 """The kernels that the programs call, in parts: each function calls some of them with next to no data.
 
-Run by the processes that `imudrv.compilation` starts. All profiles share these kernels, what distinguishes them
-is in arrays; only streams of several kinds of message have a decoder of their own. A part that needs another one's kernels finds those compiled.
+Run by the processes that `imudrv.compilation` starts. All profiles share these kernels, what distinguishes
+them is in arrays; only streams of several kinds of message have a decoder of their own. A part that needs
+another one's kernels finds those compiled.
 """
 
 import os
