@@ -173,7 +173,7 @@ def test_after_the_warm_up_no_command_compiles_a_kernel(cache: Path, tmp_path: P
         "--record can.mcap --status status",
         "imudrv decode z.mcap -o mcap.npz",
         "imudrv decode can.mcap -o can.npz",
-        "imudrv export z.mcap -o z.imr",
+        "imudrv export z.mcap --to imr -o z.imr",
         "calib identify x.raw y.raw z.raw --profile imu50-rs422 --calibration unit.yaml --site site.yaml "
         "-o new.yaml",
         "calib run --rehearse --speed max --session session",
