@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from imudrv.service.status_socket import EXIT_CODES, ask, default_status_path
+from imudrv.terminal import say
 
 EXAMPLE: Final = "--json"
 
@@ -24,5 +25,5 @@ def run(arguments: argparse.Namespace) -> int:
         json.dumps(status, indent=1) if arguments.json else "\n".join([status["health"], *status["reasons"]])
     )
     with suppress(BrokenPipeError):  # the health is the same whether or not all of it is read
-        print(text)
+        say(text)
     return EXIT_CODES[status["health"]]
