@@ -43,9 +43,10 @@ from imudrv.wire.layout import Layout
 
 MAX_RECORD_BYTES: Final = 16 << 20
 """Largest record, and largest unpacked chunk, bytes: a chunk is held packed and unpacked at once."""
-MAX_MESSAGE_BYTES: Final = 1 << 20
-"""Largest message, bytes: a read of a port, or what was published for it. Also the largest total of schemas
-and channels, which are kept."""
+MAX_MESSAGE_BYTES: Final = 4 << 20
+"""Largest message, bytes: a read of a port, or what was published for it; 16000 samples of a simulated unit."""
+MAX_DEFINITION_BYTES: Final = 1 << 20
+"""Largest total of the schemas and channels, which are kept, bytes."""
 
 _RECORD: Final = struct.Struct("<BQ")
 _MESSAGE: Final = struct.Struct("<HIQQ")
@@ -417,8 +418,8 @@ class _Definitions:
         before = self.known.setdefault((type(record), record.id), record)
         if before is record:
             self._bytes += length
-        if self._bytes > MAX_MESSAGE_BYTES:
-            return f"expected schemas and channels of at most {MAX_MESSAGE_BYTES} bytes in all"
+        if self._bytes > MAX_DEFINITION_BYTES:
+            return f"expected schemas and channels of at most {MAX_DEFINITION_BYTES} bytes in all"
         return (
             "" if before == record else f"expected schema or channel {record.id} as before, got another one"
         )
