@@ -44,7 +44,7 @@ from imudrv.wire.layout import Layout
 MAX_RECORD_BYTES: Final = 16 << 20
 """Largest record, and largest unpacked chunk, bytes: a chunk is held packed and unpacked at once."""
 MAX_MESSAGE_BYTES: Final = 4 << 20
-"""Largest message, bytes: a read of a port, or what was published for it; 16000 samples of a simulated unit."""
+"""Largest message, bytes: a read of a port, or what was published for it; simulated ones are large."""
 MAX_DEFINITION_BYTES: Final = 1 << 20
 """Largest total of the schemas and channels, which are kept, bytes."""
 
