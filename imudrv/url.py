@@ -72,6 +72,8 @@ def split(text: str, schemes: Sequence[str] = PORTS) -> Url:
         known = ", ".join(f"{scheme}://" for scheme in schemes)
         path = " or a path like /dev/ttyUSB0," if "serial" in schemes else ""
         raise InputError(f"{text}: expected a URL that begins with {known},{path} got {before!r}")
+    if not query.isprintable():
+        raise InputError(f"{text}: expected options of printable text, got {query!r}")
     try:
         pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=True) if query else []
     except ValueError:

@@ -130,7 +130,7 @@ def resume(session: Session, console: Console, redo: Sequence[str], *, asks: boo
     accepted = ", ".join(session.accepted) or "none yet"
     lines.append(f"session {session.folder} of unit {session.plan.unit}: accepted steps: {accepted}")
     console.print("\n".join(lines), markup=False, soft_wrap=True)
-    if asks and console.input("resume it? \\[y/n] ").strip().lower() not in ("y", "yes"):
+    if asks and console.input("resume it? [y/n] ", markup=False).strip().lower() not in ("y", "yes"):
         raise InputError(f"{session.folder}: not resumed and not changed; name another folder to begin anew")
     session.redo(redo)
     session.append(Resumed(session.record_leftovers()))

@@ -9,6 +9,7 @@ from calib.cli.arguments import add_certificate_output, add_gauge, check_output,
 from calib.lever_arms.gauge import convert
 from calib.reports.identification import arms_text
 from imudrv.calibration import read_calibration_file
+from imudrv.terminal import say
 from imudrv.units import MM
 
 EXAMPLE: Final = "unit.yaml --to x -o unit-x.yaml"
@@ -34,4 +35,4 @@ def run(arguments: argparse.Namespace) -> None:
         how["stated_mm"] = {accelerometer: [value / MM for value in r_b]}
     write(arguments.output, with_lever_arms(file.model, arms, PROVENANCE_CONVERTED, how))
     print(arms_text(arms), end="")
-    print(written_text(arguments.output, file.model, arms))
+    say(written_text(arguments.output, file.model, arms))

@@ -22,7 +22,8 @@ from calib.result_file import result_document, write_json
 from imudrv.cli.arguments import add_profile
 from imudrv.errors import InputError
 from imudrv.files.atomic import atomic_write
-from imudrv.terminal import progress
+from imudrv.files.inputs import total_size
+from imudrv.terminal import progress, say
 
 EXAMPLE: Final = (
     "z-up.raw x-up.raw y-up.raw --profile imu50-rs422 --calibration unit.yaml --site site.yaml -o new.yaml"
@@ -69,8 +70,7 @@ def run(arguments: argparse.Namespace) -> None:
         nine=arguments.gauge == "given" and point is None,
         extra=(arguments.estimate,) if arguments.estimate else (),
     )
-    size = sum(path.stat().st_size for path in arguments.captures if path.exists())
-    with progress("identify", 2 * size) as advance:  # each capture is read twice
+    with progress("identify", total_size(arguments.captures * 2)) as advance:  # each is read twice
         result = identify(
             arguments.captures,
             site=arguments.site,
@@ -95,7 +95,7 @@ def run(arguments: argparse.Namespace) -> None:
         written.append(written_text(arguments.output, prior.calibration, arms))
     finally:
         print_document(document(result, gauges))
-        print(*written, sep="\n")
+        say("\n".join(written))
 
 
 def _in_gauge(arms: LeverArms, gauge: Gauge | None, point: tuple[str, list[float]] | None) -> LeverArms:

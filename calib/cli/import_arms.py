@@ -16,6 +16,7 @@ from imudrv.calibration import read_calibration
 from imudrv.errors import InputError
 from imudrv.files import atomic, settings_file
 from imudrv.files.model import Model
+from imudrv.terminal import say
 
 EXAMPLE: Final = "imu.yaml --from kalibr --calibration unit.yaml -o new.yaml"
 
@@ -44,7 +45,7 @@ def run(arguments: argparse.Namespace) -> None:
     how = {"method": f"imported from {arguments.program}", "file_sha256": digest}
     write(arguments.output, with_lever_arms(calibration, arms, PROVENANCE_IDENTIFIED, how))
     print(arms_text(arms), end="")
-    print(written_text(arguments.output, calibration, arms))
+    say(written_text(arguments.output, calibration, arms))
 
 
 class _Kalibr(Model):

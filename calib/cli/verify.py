@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Final
 
 from calib.bench.verify import verify
-from imudrv.terminal import BAD_INPUT, OK
+from imudrv.terminal import BAD_INPUT, OK, say
 
 EXAMPLE: Final = "s1"
 
@@ -18,5 +18,5 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Verify a session; print what differs."""
     verified = verify(arguments.session)
-    print(verified)
+    say(str(verified))
     return BAD_INPUT if verified.faults else OK

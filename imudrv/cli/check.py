@@ -16,6 +16,7 @@ from imudrv.profiles.summary import line, summary
 from imudrv.service.settings import Settings
 from imudrv.sim.scenario import Scenario
 from imudrv.site import Site
+from imudrv.terminal import say
 
 EXAMPLE: Final = "unit.yaml"
 
@@ -41,10 +42,10 @@ def run(arguments: argparse.Namespace) -> None:
     model = settings_file.read(arguments.file, _KINDS[kind])
     if isinstance(model, Profile) and (faults := list(_line_faults(model))):
         raise FaultyFileError(str(arguments.file), faults)
-    print(f"{arguments.file}: valid {kind} file")
+    say(f"{arguments.file}: valid {kind} file")
     if isinstance(model, Profile):
         for subject, description in (("line", _line(model)), *summary(model)):
-            print(f"  {subject + ':':15}{description}")
+            say(f"  {subject + ':':15}{description}")
 
 
 def _line_faults(profile: Profile) -> Iterator[str]:

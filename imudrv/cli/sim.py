@@ -15,7 +15,7 @@ from imudrv.service.printer import Printer
 from imudrv.sim import scenario as scenarios
 from imudrv.sim.capture import record
 from imudrv.sim.live import play
-from imudrv.terminal import progress
+from imudrv.terminal import progress, say
 from imudrv.url import speed_of
 
 EXAMPLE: Final = "rocking --profile imu50-rs422 --port pty --link /tmp/imu50"
@@ -63,9 +63,9 @@ def _record(arguments: argparse.Namespace) -> None:
             if rows is not None:
                 rows.write({name: truth[name] for name in truth.dtype.names or ()})
             advance(len(truth))
-    print(
+    say(
         f"{arguments.output}: {samples} samples of {layout.name}, seed {scenario.seed}",
-        file=message_stream(arguments.output),
+        message_stream(arguments.output),
     )
 
 

@@ -79,6 +79,8 @@ def validation_faults(error: ValidationError, document: object, model: type[Mode
             found[where, str(len(came))] = [f"{limit.format(**values)} {_plural(came)}"]
         elif name == "value_error":
             found |= {(where, fault): [] for fault in str(values["error"]).splitlines()}
+        elif name == "json_invalid":  # half a character; the rest cannot be wrong here
+            found["", "expected Unicode text, got bytes that are none; is the locale UTF-8?"] = []
         elif name in _EXPECTED:
             advice = model.advice_for_value(keys, came) or _advice(name, came, values)
             rest = shown_value(came) + (f"; {advice}" if advice else "")

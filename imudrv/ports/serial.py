@@ -253,7 +253,7 @@ def _connect(url: str, address: tuple[str, int]) -> Port:
 
 def _device(url: Url) -> str:
     device = Path(device_path(url))
-    if termios is not None and device.exists() and not device.is_char_device():
+    if termios is not None and os.path.exists(device) and not device.is_char_device():
         kind = "folder" if device.is_dir() else "file"
         raise InputError(
             f"{url.text}: expected a serial device, got a {kind}; a capture is read with "
