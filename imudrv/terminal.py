@@ -10,7 +10,7 @@ from importlib.metadata import version
 
 from imudrv.errors import InputError
 
-OK, OUR_FAULT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+OK, OUR_FAULT, BAD_INPUT, NOT_GOOD, INTERRUPTED = 0, 1, 2, 3, 130
 """Exit codes."""
 
 

@@ -23,12 +23,9 @@ from imudrv.errors import InputError
 from imudrv.files.atomic import atomic_write
 from imudrv.imu.rate_filter import NAMES
 from imudrv.nav.alignment import ALIGNMENT_S
-from imudrv.terminal import OK, progress
+from imudrv.terminal import NOT_GOOD, OK, progress
 
 EXAMPLE: Final = "--simulate rocking --seeds 20 --report validation.html"
-
-NOT_GOOD: Final = 3
-"""Exit code: a verdict is bad."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
