@@ -113,6 +113,12 @@ class Contents(NamedTuple):
     partial: PartialLine | None
     signatures: list[SignedLines]
 
+    @property
+    def signature(self) -> Signature | None:
+        """Signature of the whole journal; None if there is none, or something follows it."""
+        is_whole = self.partial is None and isinstance(self.entries[-1], Signed)
+        return self.signatures[-1].signature if is_whole else None
+
 
 class Journal:
     """A journal that is open for appending.

@@ -132,7 +132,7 @@ def _verify_session(folder: Path, trusted: Mapping[str, str] | None) -> Verified
     notes = [f"{len(contents.entries)} lines and {len(files)} files checked"]
     unknown = {path.name for path in folder.iterdir() if path.is_file()} - {*files, JOURNAL, LOCK, PROFILE}
     notes += [f"{folder / name}: not in the journal, not checked" for name in sorted(unknown)]
-    signed = {JOURNAL: _signature(contents)}
+    signed = {JOURNAL: contents.signature}
     if not faults and RESULT not in files:
         if session.is_over:
             faults = [f"{folder / RESULT}: expected in the journal of a session at its end, it is not there"]
@@ -167,14 +167,6 @@ def _signature_faults(folder: Path, contents: Contents) -> list[str]:
         for number, signature, data in contents.signatures
         if not is_valid(signature, data)
     ]
-
-
-def _signature(contents: Contents) -> Signature | None:
-    """Return the signature of a whole journal; one with lines after it does not count."""
-    if not contents.signatures or contents.partial is not None:
-        return None
-    number, signature, _ = contents.signatures[-1]
-    return signature if number == len(contents.entries) else None
 
 
 def _signer(

@@ -16,10 +16,6 @@ NOT_TRUSTED: Final = 4
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    parser.epilog = (
-        f"{parser.epilog or ''}; exit code 2: damaged or changed, {NOT_GOOD}: unfinished, "
-        f"{NOT_TRUSTED}: not signed by a key of FILE"
-    )
     parser.add_argument("path", type=Path, metavar="PATH", help="folder of a session, or a certificate")
     text = "trusted public keys, see calib key show; a signature of one of them is then required"
     parser.add_argument("--key", type=Path, metavar="FILE", help=text)

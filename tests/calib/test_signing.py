@@ -382,9 +382,26 @@ def test_a_cut_signature_is_unfinished_and_made_again_when_the_session_is_resume
     assert len(journal.read(path).signatures) == 1
 
 
-def test_lines_after_a_signature_are_not_signed(session: Session) -> None:
+def test_what_follows_a_signature_is_not_signed(session: Session) -> None:
+    path = session.folder / JOURNAL
+    assert journal.read(path).signature is not None
     session.append(ServiceMessage("later"))
     assert not session.is_over
+    assert journal.read(path).signature is None
+
+
+@pytest.mark.usefixtures("signed")
+def test_a_journal_with_a_line_that_a_power_cut_left_is_signed_as_a_whole(tmp_path: Path) -> None:
+    with closing(begin(tmp_path / "session")) as session:
+        session.append(ServiceMessage("cut"))
+    path = session.folder / JOURNAL
+    path.write_bytes(path.read_bytes()[:-20])
+    with closing(Session.open(session.folder)) as again:
+        again.end(Decision(False))
+        assert again.is_over
+    contents = journal.read(path)
+    assert contents.signature is not None
+    assert is_valid(contents.signature, contents.signatures[-1].data)
 
 
 # Without the extra
