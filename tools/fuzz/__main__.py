@@ -3,9 +3,9 @@
     tools/run python -m tools.fuzz [--seconds N | --cases N] [--seed S] [--only TARGET] [--first I]
 
 Targets: the decoders (stream, candump, can, datagram), those of random profiles (profiles), settings files
-(yaml), and the processing from a capture to compensated increments (chain). Case I of a target depends on
-the seed and I alone. The first failure is reduced, written to a file, and ends the run with exit code 1;
-Ctrl-C ends it with the summary.
+(yaml), journals of bench sessions (journal), and the processing from a capture to compensated increments
+(chain). Case I of a target depends on the seed and I alone. The first failure is reduced, written to a file,
+and ends the run with exit code 1; Ctrl-C ends it with the summary.
 """
 
 import argparse

@@ -18,6 +18,7 @@ from .can import check_can, make_can
 from .candump import check_candump, make_candump
 from .chain import check_chain, make_chain
 from .datagram import check_datagram, make_datagram
+from .journal import check_journal, make_journal
 from .properties import Cuts, Setup
 from .random_input import random_cuts
 from .settings import check_yaml, make_yaml
@@ -45,6 +46,7 @@ TARGETS: Final = (
     Target("can", make_can, check_can, MESSAGE.itemsize),
     Target("datagram", make_datagram, check_datagram),
     Target("yaml", make_yaml, check_yaml),
+    Target("journal", make_journal, check_journal),
     Target("chain", make_chain, check_chain),
     Target("profiles", make_any_profile, check_any_profile),
 )
