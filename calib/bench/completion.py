@@ -107,6 +107,6 @@ def write_report(session: Session, result: Result, residual: ResidualVelocity | 
     if residual is not None:
         text = f"One more rotation with the new certificate: {residual}."
     section = f"<section>\n<h2>Verification</h2>\n<p>{text}</p>\n</section>"
-    with atomic_write(session.folder / REPORT) as file:
+    with atomic_write(session.path(REPORT)) as file:
         file.write(html.replace("</section>", f"</section>\n{section}", 1).encode())
     session.record_file(REPORT)

@@ -131,7 +131,8 @@ def _verify_session(folder: Path, trusted: Mapping[str, str] | None) -> Verified
         faults = [*_disagreements(session), *_uncovered_steps(session)]
     notes = [f"{len(contents.entries)} lines and {len(files)} files checked"]
     unknown = {path.name for path in folder.iterdir() if path.is_file()} - {*files, JOURNAL, LOCK, PROFILE}
-    notes += [f"{folder / name}: not in the journal, not checked" for name in sorted(unknown)]
+    shown = (name if name.isprintable() else ascii(name) for name in sorted(unknown))
+    notes += [f"{folder / name}: not in the journal, not checked" for name in shown]
     signed = {JOURNAL: contents.signature}
     if not faults and RESULT not in files:
         if session.is_over:

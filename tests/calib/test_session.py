@@ -26,7 +26,7 @@ from calib.bench.entries import (
 )
 from calib.bench.resume import check_files, require_same, require_temperature, resume
 from calib.bench.session import Session
-from calib.bench.state import INITIAL_CERTIFICATE, JOURNAL
+from calib.bench.state import INITIAL_CERTIFICATE, JOURNAL, LOCK
 from calib.bench.verify import verify
 from calib.cli import main
 from calib.messages import Message, english
@@ -164,6 +164,27 @@ def test_a_file_that_is_not_in_the_journal_is_reported(folder: Path) -> None:
     verified = verify(folder)
     assert verified.faults == ()
     assert any("notes.txt: not in the journal" in note for note in verified.notes)
+
+
+@pytest.mark.parametrize("name", [b"\x1b[2J", b"\xff", "é\n".encode()])
+def test_the_name_of_such_a_file_cannot_control_the_terminal(
+    folder: Path, name: bytes, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path(os.fsdecode(os.fsencode(folder) + b"/" + name)).touch()
+    assert main(["verify", str(folder)]) == 3
+    shown = ascii(os.fsdecode(name))
+    assert f"{folder}/{shown}: not in the journal, not checked\n" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", [LOCK, "report.html", "profile.yaml", "certificate.yaml"])
+def test_a_symbolic_link_is_no_file_of_a_session_to_write_to(folder: Path, name: str) -> None:
+    outside = folder.parent / "outside"
+    (folder / name).unlink(missing_ok=True)
+    (folder / name).symlink_to(outside)
+    message = rf"{name}: (expected a file in the|cannot be opened)"
+    with pytest.raises(InputError, match=message), closing(Session.open(folder)) as session:
+        session.path(name)
+    assert not outside.exists()
 
 
 # One unit
