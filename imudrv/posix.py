@@ -20,6 +20,8 @@ resource: Final = _module("resource")
 termios: Final = _module("termios")
 tty: Final = _module("tty")
 
+O_NOFOLLOW: Final[int] = getattr(os, "O_NOFOLLOW", 0)
+"""Flag for `os.open` that refuses a symbolic link; 0 where there is none."""
 O_BINARY: Final[int] = getattr(os, "O_BINARY", 0)
 """Flag for `os.open` of a file that is not text; 0 where all files are alike."""
 

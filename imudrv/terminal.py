@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.text import Text
 
-OK, OUR_FAULT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+OK, OUR_FAULT, BAD_INPUT, NOT_GOOD, INTERRUPTED = 0, 1, 2, 3, 130
 """Exit codes."""
 
 _BYTES: Final = re.compile("[\udc80-\udcff]+")

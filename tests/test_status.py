@@ -107,14 +107,12 @@ def test_a_status_of_another_version_is_refused(tmp_path: Path) -> None:
 def test_a_status_without_health_or_reasons_is_refused(
     change: dict[str, object], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    server = StatusServer(tmp_path / "socket")
     status = {"format": "imu50-status", "version": 1, "health": "ok", "reasons": [], **change}
-    with ThreadPoolExecutor() as pool:
-        code = pool.submit(imudrv, ["status", "--status", str(server.path)])
-        while not code.done():
-            server.poll(json.dumps(status).encode())
+    server = StatusServer(tmp_path / "socket", lambda: json.dumps(status).encode())
+    server.start()
+    code = imudrv(["status", "--status", str(server.path)])
     server.close()
-    assert code.result() == 2
+    assert code == 2
     assert "expected a status with health and reasons" in capsys.readouterr().err
 
 

@@ -148,10 +148,11 @@ def conduct(session: Session, options: RunOptions, console: Console) -> int:
     plan = session.plan
     simulated = SimulatedUnitProcess(session.folder, options.speed) if options.is_rehearsal else None
     queue = QueueSink(QUEUE_LIMIT if simulated is not None and simulated.waits else None)
-    layout = profiles.load(plan.profile.name).layout()
+    profile = session.profile()
+    layout = profiles.load(profile).layout()
     settings = Settings(
         port=options.port or (plan.port if simulated is None else simulated.port),
-        profile=plan.profile.name,
+        profile=profile,
         calibration=str(session.folder / WORKING_CERTIFICATE),
         unit=plan.unit,
         status=str(default_folder() / f"imu50-calib-{os.getpid()}.sock"),
@@ -168,7 +169,7 @@ def conduct(session: Session, options: RunOptions, console: Console) -> int:
 
     def begin(steps: Procedure) -> None:
         if simulated is not None:
-            simulated.begin(steps, plan.profile.name)
+            simulated.begin(steps, profile)
 
     controller = SessionController(
         session,
@@ -257,5 +258,5 @@ def _require_resumable(session: Session, options: RunOptions) -> None:
         procedure=EmbeddedFile.of(procedure, load_file(procedure).content) if procedure else None,
         calibration=options.calibration,
         site=EmbeddedFile.of(site, settings_file.read_file(site, Site).content) if site else None,
-        profile=options.profile or session.plan.profile.name,
+        profile=options.profile or session.profile(),
     )

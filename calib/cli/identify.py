@@ -19,6 +19,7 @@ from calib.lever_arms.gauge import Gauge, LeverArms, convert
 from calib.reports.identification import document, report_html
 from calib.reports.text import print_document
 from calib.result_file import result_document, write_json
+from calib.signing.keys import bench_key
 from imudrv.cli.arguments import add_profile
 from imudrv.errors import InputError
 from imudrv.files.atomic import atomic_write
@@ -64,6 +65,7 @@ def run(arguments: argparse.Namespace) -> None:
         check_output(output, *inputs)
     prior = prior_calibration(arguments.captures, arguments.calibration, arguments.unit)
     check_target(arguments.output, prior.calibration)
+    key = bench_key()
     options = EstimationOptions(
         arguments.method,
         arguments.pivot,
@@ -91,7 +93,7 @@ def run(arguments: argparse.Namespace) -> None:
             with atomic_write(arguments.report) as file:
                 file.write(report_html(result, gauges).encode())
             written.append(f"{arguments.report}: the report")
-        write(arguments.output, certificate(result, arms))
+        write(arguments.output, certificate(result, arms), key)
         written.append(written_text(arguments.output, prior.calibration, arms))
     finally:
         print_document(document(result, gauges))

@@ -22,12 +22,9 @@ from imudrv.files.atomic import atomic_write
 from imudrv.files.inputs import total_size
 from imudrv.imu.rate_filter import NAMES
 from imudrv.nav.alignment import ALIGNMENT_S
-from imudrv.terminal import OK, console, progress
+from imudrv.terminal import NOT_GOOD, OK, console, progress
 
 EXAMPLE: Final = "--simulate rocking --seeds 20 --report validation.html"
-
-NOT_GOOD: Final = 3
-"""Exit code: a verdict is bad."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

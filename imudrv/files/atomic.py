@@ -16,13 +16,17 @@ MAX_BYTES: Final = 1 << 20
 """Largest settings file, bytes."""
 
 
-def content(path: str | os.PathLike[str]) -> bytes:
-    """Return the content of a settings file.
+def content(path: str | os.PathLike[str], max_bytes: int = MAX_BYTES, kind: str = "a settings file") -> bytes:
+    """Return the content of a file, by default a settings file.
 
     Parameters
     ----------
     path : path-like
-        The file, at most `MAX_BYTES`.
+        The file.
+    max_bytes : int
+        Largest size, bytes.
+    kind : str
+        What it is, for messages.
 
     Returns
     -------
@@ -34,10 +38,10 @@ def content(path: str | os.PathLike[str]) -> bytes:
         The file cannot be read or is too large.
     """
     with open_file(path) as file:
-        data = file.read(MAX_BYTES + 1)
-    if len(data) > MAX_BYTES:
+        data = file.read(max_bytes + 1)
+    if len(data) > max_bytes:
         raise InputError(
-            f"{path}: expected a settings file of at most {MAX_BYTES} bytes, got more; is it another file?"
+            f"{path}: expected {kind} of at most {max_bytes} bytes, got more; is it another file?"
         )
     return data
 

@@ -5,7 +5,7 @@ from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 
-from imudrv.posix import O_BINARY, fcntl
+from imudrv.posix import O_BINARY, O_NOFOLLOW, fcntl
 
 
 class FileLock:
@@ -21,12 +21,12 @@ class FileLock:
     BlockingIOError
         Another process holds the lock.
     OSError
-        The file cannot be created.
+        The file cannot be created, or is a symbolic link.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._file = os.open(path, os.O_RDWR | os.O_CREAT | O_BINARY, 0o666)
+        self._file = os.open(path, os.O_RDWR | os.O_CREAT | O_NOFOLLOW | O_BINARY, 0o666)
         try:
             _lock(self._file)
             if not os.path.samestat(os.fstat(self._file), os.stat(path)):

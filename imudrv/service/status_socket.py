@@ -117,7 +117,7 @@ def ask(path: Path) -> dict[str, Any]:
         ) from error
     try:
         status = json.loads(data)
-    except ValueError:
+    except (ValueError, RecursionError):
         status = None
     if not isinstance(status, dict) or (status.get("format"), status.get("version")) != (FORMAT, VERSION):
         raise InputError(f"{path}: expected {FORMAT} version {VERSION}, got {bytes(data[:40])!r}")

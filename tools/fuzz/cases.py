@@ -18,7 +18,7 @@ from .can import check_can, make_can
 from .candump import check_candump, make_candump
 from .chain import check_chain, make_chain
 from .datagram import check_datagram, make_datagram
-from .journals import check_journal, make_journal
+from .journal import check_journal, make_journal
 from .logs import check_log, make_log
 from .properties import Cuts, Setup
 from .random_input import random_cuts
