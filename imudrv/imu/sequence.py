@@ -167,7 +167,7 @@ class SequenceTracker:
         """
         if self._state[0]["waits"]:
             frames = np.concatenate([self._state["waiting"], frames])
-        pulses = np.zeros(len(frames), self.samples_type)
+        pulses = np.empty(len(frames), self.samples_type)
         return pulses[: track(frames, *self.arrays, pulses.view(PULSES))]
 
 

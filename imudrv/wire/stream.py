@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from imudrv.kernels import kernel
 from imudrv.records import FRAME, REJECT, Reason, Records
-from imudrv.wire.fields import SLACK, checks_hold, fill, hold, plain_check_holds
+from imudrv.wire.fields import SLACK, checks_hold, fill, fill_all, hold, plain_check_holds
 from imudrv.wire.layout import MAX_MESSAGES, Layout
 from imudrv.wire.tables import Tables, layout_tables
 
@@ -278,7 +278,7 @@ def _scan(
         Position of the first byte that is neither in a frame nor rejected; number of frames and of rejects.
     """
     # Out of the tuple once: each access inside the loop would count references.
-    kinds, fields, multiplexed, constants, _ = tables
+    kinds, fields, _, constants, _ = tables
     kind, s = kinds[0], state[0]
     length, offset = kind["length"], s["offset"]
     p = found = rejected = read = 0
@@ -301,12 +301,13 @@ def _scan(
             p += 1
             continue
         frame = frames[found]
-        fill(data, p, kind, fields, multiplexed, frame)
-        frame["offset"], frame["t_ns"] = offset + p, times[read]
-        frame["damaged"] = (s["skipped"] + length - 1) // length
-        s["skipped"] = 0
+        frame["offset"], frame["t_ns"], frame["damaged"] = offset + p, times[read], 0
+        if s["skipped"]:
+            frame["damaged"] = (s["skipped"] + length - 1) // length
+            s["skipped"] = 0
         found += 1
         p += length
+    fill_all(data, offset, kind, fields, frames[:found])
     return p, found, rejected
 
 
