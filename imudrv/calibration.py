@@ -165,6 +165,11 @@ class SensingPoints(Model):
     y: tuple[Arm, Arm, Arm]
     z: tuple[Arm, Arm, Arm]
 
+    @property
+    def r_m(self) -> Array:
+        """The points, m, shape (3, 3): row i is that of accelerometer i, body axes."""
+        return _array([self.x, self.y, self.z], MM)
+
 
 class SizeEffect(Model):
     """Sensing points of the accelerometers, and the gauge that they are in."""
@@ -193,7 +198,7 @@ class SizeEffect(Model):
     @property
     def r_m(self) -> Array:
         """Sensing points, m, shape (3, 3): row i is that of accelerometer i, body axes."""
-        return _array([self.r_mm.x, self.r_mm.y, self.r_mm.z], MM)
+        return self.r_mm.r_m
 
     @property
     def covariance_m2(self) -> Array | None:
