@@ -17,10 +17,6 @@ from imudrv.units import DEG_PER_SQRT_H
 
 _FOLDER: Final = Path(__file__).parents[1] / "procedures"
 
-TURN_S: Final = 2.5
-"""Duration of a rotation by hand from rest to rest, for predictions, s."""
-
-
 TYPICAL_NOISE: Final = Noise(
     angle_walk=0.002 * DEG_PER_SQRT_H, velocity_walk=8e-5, velocity_white=6e-5, velocity_pulse=1.2e-4
 )
@@ -50,7 +46,7 @@ def predicted(procedure: Procedure, site: Site, skipped: Collection[str] = ()) -
         The six differences are not observable from these rotations; names the directions.
     """
     plan = [
-        PlannedRotation(step.up, step.turn_deg, TURN_S, step.rest_s)
+        PlannedRotation(step.up, step.turn_deg, turn_s(procedure), step.rest_s)
         for step in procedure.steps
         if step.id not in skipped
     ]
@@ -58,6 +54,12 @@ def predicted(procedure: Procedure, site: Site, skipped: Collection[str] = ()) -
         return predict(plan, site.latitude_rad, TYPICAL_NOISE)
     except InputError as error:
         raise InputError(f"procedure {procedure.name}: {error}") from error
+
+
+def turn_s(procedure: Procedure) -> float:
+    """Return the duration of a rotation by hand from rest to rest, s."""
+    shortest, longest = procedure.turn_s
+    return 0.5 * (shortest + longest)
 
 
 def steps_left(procedure: Procedure, done: Collection[str]) -> Procedure:
@@ -80,7 +82,8 @@ def steps_left(procedure: Procedure, done: Collection[str]) -> Procedure:
 def verification(procedure: Procedure) -> Procedure:
     """Return a procedure of one more rotation, `VERIFICATION`, from the pose in which the last one ended."""
     last = procedure.steps[-1]
-    return _with_steps(procedure, [replace(last, id=VERIFICATION, east=opposite(last.east))])
+    east = opposite(last.east) if last.turns % 2 else last.east
+    return _with_steps(procedure, [replace(last, id=VERIFICATION, east=east, turns=1)])
 
 
 def _with_steps(procedure: Procedure, steps: Sequence[Step]) -> Procedure:

@@ -110,7 +110,7 @@ def test_an_id_given_twice_is_refused() -> None:
 
 def test_a_procedure_that_is_not_there_names_the_shipped_ones() -> None:
     with pytest.raises(
-        InputError, match=r"'four': expected one of six-rotations, three-rotations, or the path"
+        InputError, match=r"'four': expected one of six-rotations, ten-turns, three-rotations, or the path"
     ):
         load("four")
 
