@@ -267,7 +267,7 @@ def identify(
         source = _read(
             path,
             _label(path, [source.label for source in sources]),
-            calibration=calibration.calibration.without_size_effect(),
+            calibration=calibration.calibration.without_size_effect().without_skew(),
             site=site,
             profile=profile_of(profile),
             channel=channel,

@@ -116,7 +116,7 @@ def identify(
     InputError
         A recording cannot be read or lacks its rotation, or `estimate_joint` refuses.
     """
-    priors, bare = Priors(), prior_calibration.calibration.without_size_effect()
+    priors, bare = Priors(), prior_calibration.calibration.without_size_effect().without_skew()
     sources = tuple(_summarise(procedure, attempt, bare, site) for attempt in attempts)
     result = estimate_joint([run for source in sources for run in source.rotations.runs], priors)
     limits = procedure.rotation_limits(procedure.steps[0])

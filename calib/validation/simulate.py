@@ -103,9 +103,8 @@ def subject(unit: Unit, seed: int, *, procedure: Sequence[str] = PROCEDURE) -> S
 def true_calibration(unit: Unit, seed: int) -> Calibration:
     """Return the calibration of the unit that a seed draws, which would leave no error."""
     nominal = unit.calibration or NOMINAL
-    drawn = draw_true_unit(
-        scenarios.load(PROCEDURE[0]).model_copy(update={"unit": unit, "seed": seed}), LAYOUT
-    )
+    seeded = unit.model_copy(update={"seed": seed})
+    drawn = draw_true_unit(scenarios.load(PROCEDURE[0]).model_copy(update={"unit": seeded}), LAYOUT)
     return nominal.model_copy(
         update={
             "gyro": Gyro(
@@ -138,7 +137,7 @@ def scenario(name: str, align_s: float = ALIGNMENT_S) -> Scenario:
     """
     shipped = scenarios.load(TRIALS[name])
     first, *motion = shipped.motion
-    rest_s = BEFORE_S if motion else first.motion.duration_s
+    rest_s = BEFORE_S if motion else first.motions[0].duration_s
     return shipped.model_copy(
         update={"motion": (Segment(rest=Rest(duration_s=align_s + rest_s)), *motion)},
     )

@@ -23,7 +23,7 @@ EXAMPLE: Final = "rocking --profile imu50-rs422 --port pty --link /tmp/imu50"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    text = f"{', '.join(scenarios.shipped())}, or a scenario file"
+    text = f"{', '.join(scenarios.shipped())}, or a scenario file (keys: tools/guides/simulation.md)"
     parser.add_argument("scenario", help=text)
     add_profile(parser, required=True)
     target = parser.add_mutually_exclusive_group(required=True)
