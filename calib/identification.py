@@ -182,7 +182,7 @@ class IdentificationResult:
 
     @property
     def _summary(self) -> str:
-        result, n = self.result, len(self.result.runs)
+        result, n = self.result, len(self.result.turns)
         verdict = "; ".join(result.refusals) or "usable for a certificate"
         return (
             f"unit {self.prior_calibration.calibration.serial_number}, method {result.method}, "

@@ -211,7 +211,7 @@ def _navigate(
     if len(navigated.runs) != 1:
         reasons = "; ".join(english(reason) for _, reasons in navigated.rejected for reason in reasons)
         raise InputError(
-            f"{attempt.recording}: expected the one rotation that was accepted, got {len(navigated.runs)}: "
+            f"{attempt.recording}: expected the one run that was accepted, got {len(navigated.runs)}: "
             f"{reasons or 'no motion'}"
         )
     return navigated
