@@ -356,7 +356,7 @@ class Resting(PhaseState):
         """Accept or reject the attempt."""
         p, attempt = self.progress, self.progress.attempt
         rotation = attempt.rotation(attempt.turns[-1].begun)
-        reasons = _rejections(p, rotation, p.step.rest_s) if p.step.turns == 1 else self._too_few_turns()
+        reasons = self._reasons(rotation)
         accepted = None if reasons or rotation is None else self._accepted(rotation)
         if accepted is None:
             return p.reject(*reasons)
@@ -365,8 +365,13 @@ class Resting(PhaseState):
         p.bells += 1
         return Outcome.ACCEPTED
 
-    def _too_few_turns(self) -> tuple[Message, ...]:
-        turns = self.progress.attempt.turns
+    def _reasons(self, rotation: Rotation | None) -> tuple[Message, ...]:
+        """Return why the run cannot be used; `rotation` is the last one."""
+        p, turns = self.progress, self.progress.attempt.turns
+        if p.step.turns == 1:
+            return _rejections(p, rotation, p.step.rest_s)
+        if rotation is None:
+            return (message("no_rotation"),)
         within = sum(turn.is_within_limits for turn in turns)
         if 2 * within >= len(turns):
             return ()
