@@ -21,11 +21,14 @@ from calib.bench.resume import check_files, require_same, resume
 from calib.bench.screen import OperatorScreen
 from calib.bench.session import Session
 from calib.bench.simulated_unit import SimulatedUnitProcess, is_rehearsal
-from calib.bench.state import JOURNAL, REPORT, WORKING_CERTIFICATE
+from calib.bench.state import JOURNAL, REPORT, RESULT, WORKING_CERTIFICATE
 from calib.bench.technician import BENCH
+from calib.certificate import lever_arms_of
 from calib.inputs import require_six_axes
 from calib.procedure import plan
 from calib.procedure.schema import Procedure
+from calib.reports.text import as_text
+from calib.reports.truth import comparison
 from imudrv import profiles
 from imudrv.calibration import coefficients, read_calibration
 from imudrv.errors import InputError
@@ -206,6 +209,11 @@ def conduct(session: Session, options: RunOptions, console: Console) -> int:
     if not controller.outcome:
         return INTERRUPTED
     console.print(controller.outcome, markup=False, highlight=False, soft_wrap=True)
+    if simulated is not None:
+        result = session.folder / RESULT
+        found = lever_arms_of(read_calibration(result), str(result))
+        against = comparison(found, simulated.truth(layout), "the simulated unit")
+        console.print(as_text(against), markup=False, highlight=False, soft_wrap=True)
     return OK
 
 

@@ -166,6 +166,9 @@ def test_the_operator_sees_every_step_and_the_result(
             assert any(step in line and words in line for line in said.splitlines())
     assert f"report: {folder / 'report.html'}" in said
     assert "residual velocity after half a turn" in said
+    # what the rehearsal knows of the truth is shown at its end only
+    assert said.count("rms error of the nine components") == 1
+    assert said.index("rms error of the nine components") > said.index("active certificate")
 
 
 def test_a_rehearsal_in_fast_time_is_not_reported_as_a_wrong_rate(undisturbed: tuple[Path, str]) -> None:
@@ -577,6 +580,20 @@ def test_the_plan_contains_the_site_and_procedure_that_were_checked(
     with pytest.raises(CreatedError) as created:
         run(options, Console())
     assert created.value.args == texts
+
+
+def test_a_plan_is_shown_without_a_unit_and_makes_no_session(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, site = tmp_path / "new", tmp_path / "site.yaml"
+    site.write_text("{latitude_deg: 28.2, longitude_deg: 113.0, height_m: 60.0}\n")
+
+    assert run(RunOptions(folder, site=site, procedure="ten-turns", plan=True), Console(width=200)) == 0
+
+    assert "ten-turns: 30 rotations, about 9 min" in capsys.readouterr().out
+    assert not folder.exists()
+    with pytest.raises(InputError, match="--plan: expected --site, for the latitude, or --rehearse"):
+        run(RunOptions(folder, procedure="ten-turns", plan=True), Console())
 
 
 def test_a_new_session_needs_port_profile_calibration_and_site(tmp_path: Path) -> None:
