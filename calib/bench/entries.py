@@ -25,6 +25,7 @@ from calib.procedure.events import (
     Rejected,
     Restarted,
     Skipped,
+    Turned,
 )
 from imudrv.calibration import Base64Of32Bytes, Base64Of64Bytes, SerialNumber
 from imudrv.errors import FaultyFileError
@@ -242,7 +243,7 @@ class Signed:
 
 
 Counted: TypeAlias = (
-    Entered | Checked | Restarted | Rejected | Skipped | Redone | Finished | Aborted | UnitDetected
+    Entered | Checked | Restarted | Turned | Rejected | Skipped | Redone | Finished | Aborted | UnitDetected
 )
 """Entries with the counter of the newest sample."""
 

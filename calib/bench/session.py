@@ -3,7 +3,7 @@
 ====================  ===================================================================================
 ``journal.jsonl``     see `calib.bench.journal`; its first line is the plan
 ``before.yaml``       the unit's certificate at the beginning
-``working.yaml``      the same without size effect: the service compensates with it
+``working.yaml``      the same without size effect and skew: the service compensates with it
 ``profile.yaml``      the plan's profile for the service, unless it is a shipped one
 ``run-STEP-N.mcap``   recording of the N-th attempt at a step, and ``run-STEP-N.npz`` its velocity and H
 ``certificate.yaml``  the result, and ``report.html``
@@ -135,7 +135,8 @@ class Session(SessionState):
                     f"{folder}: expected a new folder, it contains a session; resume it, or name another"
                 )
             (folder / INITIAL_CERTIFICATE).write_bytes(before.content)
-            write_calibration(folder / WORKING_CERTIFICATE, before.model.without_size_effect())
+            working = before.model.without_size_effect().without_skew()  # both are estimated
+            write_calibration(folder / WORKING_CERTIFICATE, working)
             journal.begin(folder / JOURNAL, plan)
             return cls(folder, lock, key)
         except BaseException:
