@@ -135,7 +135,7 @@ def test_a_candump_log_works_for_the_can_profiles(bench: Path) -> None:
     [
         (
             ["decode", "nothing.raw", "--profile", "imu50-rs422", "-o", "o.npz"],
-            "nothing.raw: expected a capture",
+            "nothing.raw: expected a file, there is none; check the path",
         ),
         (
             ["decode", "run.raw", "--profile", "imu51", "-o", "o.npz"],

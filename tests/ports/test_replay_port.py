@@ -206,7 +206,7 @@ def test_a_file_that_cannot_be_replayed_is_a_mistake_of_the_user(capture, rs422,
     empty.touch()
     with pytest.raises(InputError, match="expected a file to replay, got an empty one"):
         open_port(f"replay://{empty}", rs422)
-    with pytest.raises(InputError, match="expected a file to replay, cannot read it: Is a directory"):
+    with pytest.raises(InputError, match="expected a file, got a folder"):
         open_port(f"replay://{tmp_path}", rs422)
     for name, profile, kind in (
         ("unit.raw", rs422, "a capture of imu50-rs422"),
