@@ -18,13 +18,14 @@ import serial
 
 from imudrv.errors import InputError
 from imudrv.imu.sequence import SampleCounts, SequenceTracker
+from imudrv.loopback import LOOPBACK
 from imudrv.ports.base import PortLostError
 from imudrv.ports.serial import explain, receiver_of
 from imudrv.posix import require_posix
 from imudrv.profiles.schema import SerialLine
 from imudrv.records import FRAME, Records
 from imudrv.sinks.serial import BAUDRATE
-from imudrv.url import LOOPBACK, Url, device_path, host_and_port, serial_settings, split
+from imudrv.url import Url, device_path, host_and_port, serial_settings, split
 from imudrv.wire.datagram import DatagramDecoder
 from imudrv.wire.layout import Layout, Sequence, SequenceKind
 

@@ -13,7 +13,6 @@ from imudrv.profiles.schema import SerialLine
 PYSERIAL: Final = ("socket", "rfc2217", "spy", "hwgrep", "alt", "loop", "cp2110")
 PORTS: Final = ("serial", *PYSERIAL, "can", "replay", "sim")
 """Schemes of ports."""
-LOOPBACK: Final = "127.0.0.1"
 _WINDOWS_PORT: Final = re.compile(r"COM\d+", re.IGNORECASE)
 SLOWEST: Final = 1e-3
 FASTEST: Final = 1e6

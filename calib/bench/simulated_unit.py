@@ -15,9 +15,10 @@ from imudrv import profiles
 from imudrv.calibration import write_calibration
 from imudrv.errors import InputError
 from imudrv.files import settings_file
+from imudrv.loopback import LOOPBACK
 from imudrv.posix import termios
 from imudrv.sim.scenario import nominal
-from imudrv.url import LOOPBACK, speed_of
+from imudrv.url import speed_of
 from imudrv.wire.layout import Layout
 
 SEED: Final = 1

@@ -16,7 +16,7 @@ from typing import Final
 from imudrv.errors import InputError
 from imudrv.files.atomic import change_mark
 from imudrv.files.lock import FileLock
-from imudrv.url import LOOPBACK
+from imudrv.loopback import LOOPBACK
 
 _SOCKETS: Final = "imu50*.sock"
 _MARK: Final = b"imu50-status "
