@@ -18,6 +18,7 @@ Data flow; every module can be read alone::
     estimation      rotations aligned and navigated; lever arms from their velocities; accuracy of a plan
     lever_arms      gauges, and the formats of other programs
     identification  captures to an identification result
+    alignment       a rest of a capture to level and heading, compared with the site
     result_file     the result as JSON      certificate  the result as a calibration file
 
     procedure       the bench procedure as data, and its state machine
@@ -26,6 +27,7 @@ Data flow; every module can be read alone::
     dither          effect of gyro dither on the size effect
     reports         reports as text, for a terminal and as HTML
     messages        texts for the operator, by key
+    signing         keys, and signatures of sessions and certificates
     api             functions for a notebook      cli  the command `calib`
 
 Increments are compensated for everything except the size effect. The conventions are those of `imudrv`.
@@ -35,6 +37,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from calib.alignment import align as align
     from calib.api import load_procedure as load_procedure
     from calib.api import predict as predict
     from calib.api import validate as validate
@@ -50,6 +53,7 @@ _MODULES = {
     "LeverArms": "calib.lever_arms.gauge",
     "PlannedRotation": "calib.estimation.predict",
     "Session": "calib.bench.session",
+    "align": "calib.alignment",
     "identify": "calib.identification",
     "load_procedure": "calib.api",
     "predict": "calib.api",

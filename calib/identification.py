@@ -182,7 +182,7 @@ class IdentificationResult:
 
     @property
     def _summary(self) -> str:
-        result, n = self.result, len(self.result.runs)
+        result, n = self.result, len(self.result.turns)
         verdict = "; ".join(result.refusals) or "usable for a certificate"
         return (
             f"unit {self.prior_calibration.calibration.serial_number}, method {result.method}, "
@@ -267,7 +267,7 @@ def identify(
         source = _read(
             path,
             _label(path, [source.label for source in sources]),
-            calibration=calibration.calibration.without_size_effect(),
+            calibration=calibration.calibration.without_size_effect().without_skew(),
             site=site,
             profile=profile_of(profile),
             channel=channel,

@@ -6,6 +6,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
+from calib.detection.turns import Turn
 from calib.estimation.result import LeverArmEstimate
 from calib.estimation.runs import Priors, Run
 from calib.identification import CaptureSummary, IdentificationResult, scatter
@@ -81,9 +82,16 @@ def result_document(identification: IdentificationResult, arms: LeverArms) -> di
         "runs": [
             {
                 **_profile(run),
-                "V_n_m_s": outcome.V_n.tolist(),
-                "H_n_m_s_per_m": outcome.H.tolist(),
-                "V_n_minus_H_R_m_s": outcome.compensated_n.tolist(),
+                "turns": [
+                    {
+                        **_turn(turn),
+                        "turn": gained.label,
+                        "V_n_m_s": gained.V_n.tolist(),
+                        "H_n_m_s_per_m": gained.H.tolist(),
+                        "V_n_minus_H_R_m_s": gained.compensated_n.tolist(),
+                    }
+                    for turn, gained in zip(run.turns, outcome.turns, strict=True)
+                ],
                 "H_rest_m_s_per_m": outcome.H_rest,
                 "t_s": outcome.t_s.tolist(),
                 "v_n_m_s": outcome.v_n.tolist(),
@@ -173,19 +181,12 @@ def outcome_document(result: LeverArmEstimate) -> dict[str, Any]:
 
 
 def _profile(run: Run) -> dict[str, Any]:
-    """Return the properties of a rotation."""
-    rotation, aligned = run.rotation, run.aligned
+    """Return the properties of a run."""
+    aligned, before = run.aligned, run.turns[0].before
     return {
         "run": run.label,
-        "up": rotation.axis,
-        "start_s": rotation.start_s,
-        "stop_s": rotation.stop_s,
-        "angle_deg": rotation.angle_deg,
-        "peak_deg_per_s": rotation.peak_deg_per_s,
-        "axis_tilt_deg": rotation.axis_tilt_deg,
-        "missing_samples": rotation.missing,
-        "rest_before_s": rotation.before.duration_s,
-        "rest_after_s": rotation.after.duration_s,
+        "up": run.turns[0].axis,
+        "rest_before_s": before.duration_s,
         "alignment": {
             "duration_s": aligned.duration_s,
             "heading_deg": aligned.heading_rad / DEG,
@@ -193,6 +194,21 @@ def _profile(run: Run) -> dict[str, Any]:
             "level_sigma_arcsec": aligned.level_sigma_rad / ARCSEC,
             "motion": aligned.motion,
         },
+    }
+
+
+def _turn(turn: Turn) -> dict[str, Any]:
+    """Return the properties of a turn."""
+    return {
+        "accepted": turn.accepted,
+        "reasons": [*map(english, turn.reasons)],
+        "start_s": turn.start_s,
+        "stop_s": turn.stop_s,
+        "angle_deg": turn.angle_deg,
+        "peak_deg_per_s": turn.peak_deg_per_s,
+        "axis_tilt_deg": turn.axis_tilt_deg,
+        "missing_samples": turn.missing,
+        "rest_after_s": turn.after.duration_s,
     }
 
 

@@ -8,7 +8,7 @@ import os
 from typing import Annotated, Final, Literal, Self, TypeAlias
 
 import numpy as np
-from pydantic import AfterValidator, JsonValue, model_validator
+from pydantic import AfterValidator, JsonValue, ValidationError, model_validator
 from pydantic import Field as Key
 
 from imudrv.arrays import Array
@@ -16,6 +16,7 @@ from imudrv.errors import InputError
 from imudrv.files.model import Matrix3, Model, UtcTime
 from imudrv.files.settings_file import SettingsFile, read_file, write
 from imudrv.imu.coefficients import Coefficients, TemperatureTerms
+from imudrv.sensor_calibration import Noise, SensorsProvenance, number_paths
 from imudrv.units import ARCSEC, DEG_PER_H, MM, PPM, UG
 
 NORM_TOLERANCE: Final = 0.1
@@ -28,6 +29,8 @@ COVARIANCE_TOLERANCE_MM2: Final = 5e-6
 """Largest asymmetry and negative eigenvalue of a covariance: nine entries, each rounded to six decimals."""
 MAX_PROVENANCE: Final = 1 << 18
 """Largest provenance, characters of JSON."""
+PROVENANCE_SENSORS: Final = "sensors"
+"""Key in the provenance: how the sensors were calibrated, see `SensorsProvenance`."""
 
 Row9: TypeAlias = tuple[float, float, float, float, float, float, float, float, float]
 Matrix9: TypeAlias = tuple[Row9, Row9, Row9, Row9, Row9, Row9, Row9, Row9, Row9]
@@ -85,7 +88,18 @@ def _provenance(values: dict[str, JsonValue]) -> dict[str, JsonValue]:
         raise ValueError("expected finite numbers, got NaN or infinity") from None
     if size > MAX_PROVENANCE:
         raise ValueError(f"expected at most {MAX_PROVENANCE} characters, got {size}")
+    if (sensors := values.get(PROVENANCE_SENSORS)) is not None:
+        try:
+            _sensors_provenance(sensors)
+        except ValidationError as error:
+            first = error.errors()[0]
+            path = ".".join(map(str, (PROVENANCE_SENSORS, *first["loc"])))
+            raise ValueError(f"{path}: {first['msg'].removeprefix('Value error, ')}") from None
     return values
+
+
+def _sensors_provenance(document: JsonValue) -> SensorsProvenance:
+    return SensorsProvenance.model_validate_json(json.dumps(document))
 
 
 def _range(limits: tuple[float, float]) -> tuple[float, float]:
@@ -103,9 +117,16 @@ AccelerometerBias = Annotated[float, Key(ge=-1e5, le=1e5)]
 GyroBiasSlope = Annotated[float, Key(ge=-100, le=100)]
 AccelerometerBiasSlope = Annotated[float, Key(ge=-1e4, le=1e4)]
 ScaleSlope = Annotated[float, Key(ge=-1e3, le=1e3)]
+Quadratic = Annotated[float, Key(ge=-1e4, le=1e4)]
+Asymmetry = Annotated[float, Key(ge=-1e4, le=1e4)]
+Skew = Annotated[float, Key(ge=-100, le=100)]
 Celsius = Annotated[float, Key(ge=-100, le=200)]
 Arm = Annotated[float, Key(ge=-1000, le=1000)]
 Axes = Annotated[Matrix3, AfterValidator(_axes)]
+SerialNumber = Annotated[str, Key(max_length=64), AfterValidator(_serial_number)]
+# Base64 in its one canonical form: no other text stands for the same bytes.
+Base64Of32Bytes = Annotated[str, Key(pattern=r"^[A-Za-z0-9+/]{42}[AEIMQUYcgkosw048]=$")]
+Base64Of64Bytes = Annotated[str, Key(pattern=r"^[A-Za-z0-9+/]{85}[AQgw]==$")]
 
 
 def _array(values: object, unit: float = 1.0) -> Array:
@@ -119,12 +140,15 @@ class Gyro(Model):
     """The gyros: ``dtheta_b = C_bg @ (scale * N) - bias * tau``.
 
     N are pulses, or angles of a unit that sends them in angular units; then the scale is about 1.
+    `frame`: the body axes are put along the gyros (X along gyro X, Y in the plane of gyros X and Y), or along
+    the normals of the faces that the unit stands on.
     """
 
     scale_arcsec_per_pulse: tuple[GyroScale, GyroScale, GyroScale] | None = None
     scale: tuple[Scale, Scale, Scale] | None = None
     bias_deg_per_h: tuple[GyroBias, GyroBias, GyroBias]
     C_bg: Axes
+    frame: Literal["gyro", "faces"] | None = None
 
     @model_validator(mode="after")
     def _has_one_scale(self) -> Self:
@@ -136,12 +160,16 @@ class Accelerometer(Model):
     """The accelerometers: ``dv_b = C_ba @ (N / scale - bias * tau)``.
 
     N are pulses, or velocities of a unit that sends them in units of velocity; then the scale is about 1.
+    `quadratic_ug_per_g2`, and `asymmetry_ppm`, the difference of the scales of positive and negative input,
+    are on the sensing axes.
     """
 
     scale_pulse_per_m_s: tuple[AccelerometerScale, AccelerometerScale, AccelerometerScale] | None = None
     scale: tuple[Scale, Scale, Scale] | None = None
     bias_ug: tuple[AccelerometerBias, AccelerometerBias, AccelerometerBias]
     C_ba: Axes
+    quadratic_ug_per_g2: tuple[Quadratic, Quadratic, Quadratic] | None = None
+    asymmetry_ppm: tuple[Asymmetry, Asymmetry, Asymmetry] | None = None
 
     @model_validator(mode="after")
     def _has_one_scale(self) -> Self:
@@ -164,6 +192,11 @@ class SensingPoints(Model):
     x: tuple[Arm, Arm, Arm]
     y: tuple[Arm, Arm, Arm]
     z: tuple[Arm, Arm, Arm]
+
+    @property
+    def r_m(self) -> Array:
+        """The points, m, shape (3, 3): row i is that of accelerometer i, body axes."""
+        return _array([self.x, self.y, self.z], MM)
 
 
 class SizeEffect(Model):
@@ -193,7 +226,7 @@ class SizeEffect(Model):
     @property
     def r_m(self) -> Array:
         """Sensing points, m, shape (3, 3): row i is that of accelerometer i, body axes."""
-        return _array([self.r_mm.x, self.r_mm.y, self.r_mm.z], MM)
+        return self.r_mm.r_m
 
     @property
     def covariance_m2(self) -> Array | None:
@@ -212,26 +245,63 @@ class Temperature(Model):
     accelerometer_scale_ppm_per_k: tuple[ScaleSlope, ScaleSlope, ScaleSlope]
 
 
+class Signature(Model):
+    """An Ed25519 signature and the public key that it belongs to; see `calib.signing`."""
+
+    public_key: Base64Of32Bytes
+    ed25519: Base64Of64Bytes
+
+
 class Calibration(Model):
     """The certificate of one unit.
 
     Without `size_effect` the size effect is not compensated; without `temperature` nothing depends on the
-    temperature. `provenance` describes how the calibration was made; it is preserved unchanged.
+    temperature. `skew_ms`: time by which the samples of the accelerometers end later than those of the gyros.
+    `provenance` describes how the calibration was made; it is preserved unchanged. Its `sensors` is a
+    `SensorsProvenance`; the covariance there names numbers of this certificate. `signature` belongs to the
+    bytes of one file: it is the last key there, and no copy of the model is written with it.
     """
 
     format: Literal["imu50-calibration"]
     version: Literal[1]
-    serial_number: Annotated[str, Key(max_length=64), AfterValidator(_serial_number)]
+    serial_number: SerialNumber
     created: UtcTime
     gyro: Gyro
     accelerometer: Accelerometer
     size_effect: SizeEffect | None = None
     temperature: Temperature | None = None
+    skew_ms: Skew | None = None
+    noise: Noise | None = None
     provenance: Annotated[dict[str, JsonValue], AfterValidator(_provenance)] | None = None
+    signature: Annotated[Signature | None, Key(exclude=True)] = None
+
+    @model_validator(mode="after")
+    def _covariance_names_numbers(self) -> Self:
+        covariance = None if self.sensors is None else self.sensors.covariance
+        if covariance is None:
+            return self
+        sections = {"gyro", "accelerometer", "size_effect", "temperature", "skew_ms"}
+        document = self.model_dump(include=sections, exclude={"size_effect": {"covariance_mm2"}})
+        if unknown := set(covariance.names) - set(number_paths(document)):
+            raise ValueError(
+                f"provenance.{PROVENANCE_SENSORS}.covariance.names: expected numbers of this certificate, "
+                f"such as gyro.bias_deg_per_h[0], got {', '.join(sorted(unknown))}"
+            )
+        return self
+
+    @property
+    def sensors(self) -> SensorsProvenance | None:
+        """How the sensors were calibrated; None where it is not known."""
+        document = (self.provenance or {}).get(PROVENANCE_SENSORS)
+        return None if document is None else _sensors_provenance(document)
 
     def without_size_effect(self) -> Self:
         """Return the same calibration without the sensing points."""
         return self.model_copy(update={"size_effect": None})
+
+    def without_skew(self) -> Self:
+        """Return the same calibration without the skew."""
+        return self.model_copy(update={"skew_ms": None})
 
 
 def read_calibration(path: str | os.PathLike[str], unit: str | None = None) -> Calibration:
@@ -300,7 +370,7 @@ def require_unit(calibration: Calibration, unit: str | None, name: str) -> None:
 
 
 def write_calibration(path: str | os.PathLike[str], calibration: Calibration) -> None:
-    """Write a calibration; an existing file is kept under a name with its time.
+    """Write a calibration, unsigned; an existing file is kept under a name with its time.
 
     Parameters
     ----------
@@ -329,7 +399,13 @@ def coefficients(calibration: Calibration) -> Coefficients:
     -------
     Coefficients
         SI.
+
+    Raises
+    ------
+    InputError
+        The calibration has terms that this version does not compensate.
     """
+    _require_compensable(calibration)
     gyro, accelerometer, terms = calibration.gyro, calibration.accelerometer, calibration.temperature
     return Coefficients(
         gyro_scale=_array(gyro.scale_arcsec_per_pulse or gyro.scale, ARCSEC if gyro.scale is None else 1.0),
@@ -352,3 +428,18 @@ def coefficients(calibration: Calibration) -> Coefficients:
         gyro_in_pulses=gyro.scale is None,
         accelerometer_in_pulses=accelerometer.scale is None,
     )
+
+
+def _require_compensable(calibration: Calibration) -> None:
+    """Refuse terms that would be left in the increments without a word."""
+    accelerometer = calibration.accelerometer
+    terms = {
+        "accelerometer.quadratic_ug_per_g2": accelerometer.quadratic_ug_per_g2 or (),
+        "accelerometer.asymmetry_ppm": accelerometer.asymmetry_ppm or (),
+        "skew_ms": (calibration.skew_ms or 0.0,),
+    }
+    if left := [name for name, values in terms.items() if any(values)]:
+        raise InputError(
+            f"calibration of unit {calibration.serial_number!r}: expected no {' or '.join(left)}, which this "
+            "version does not compensate, got one; use a version that does, or a certificate without"
+        )

@@ -24,7 +24,7 @@ from imudrv.imu.rate_filter import RateFilterName
 from imudrv.imu.sequence import SequenceTracker, TrackerArrays, track
 from imudrv.kernels import kernel
 from imudrv.profiles.schema import Profile
-from imudrv.records import FRAME, INCREMENTS, REJECT, Flag, Records, Source
+from imudrv.records import FRAME, INCREMENTS, PULSES, REJECT, Flag, Records, Source
 from imudrv.wire.can import CanArrays, CanAssembler, assemble
 from imudrv.wire.datagram import DATAGRAM, KINDS, SIZE, encode, fill_datagrams
 from imudrv.wire.decoder import FrameDecoder
@@ -44,7 +44,7 @@ FLOW: Final = np.dtype(
 
 Stages: TypeAlias = tuple[
     Records,  # FRAME; the first row is for the one that waits
-    Records,  # samples
+    Records,  # PULSES
     Records,  # INCREMENTS
     NDArray[np.uint8],  # datagrams, shape (n, SIZE)
     Records,  # DATAGRAM, the same memory
@@ -233,7 +233,7 @@ class Chain:
         """Put the arrays of all stages together."""
         self._stages: Stages = (
             self._frames,
-            self._samples,
+            self._samples.view(PULSES),
             self._increments,
             self._datagrams,
             self._datagrams.view(DATAGRAM),

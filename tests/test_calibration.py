@@ -215,7 +215,11 @@ def test_the_compensation_gets_what_the_certificate_says() -> None:
         ("provenance", ["a"], "provenance: expected a mapping (key: value), got a list of 1"),
         ("provenance", {"sigma": math.nan}, "provenance: expected finite numbers, got NaN or infinity"),
         ("provenance", {"log": "x" * 300_000}, "provenance: expected at most 262144 characters, got 300011"),
-        ("gyro.temperature", {}, "gyro.temperature: unknown key; known are C_bg, bias_deg_per_h, scale"),
+        (
+            "gyro.temperature",
+            {},
+            "gyro.temperature: unknown key; known are C_bg, bias_deg_per_h, frame, scale",
+        ),
     ],
 )
 def test_a_fault_names_its_place(path: str, value: Any, words: str) -> None:
@@ -303,6 +307,140 @@ def test_a_covariance_that_is_not_symmetric_is_a_fault() -> None:
     assert words.startswith(
         "size_effect.covariance_mm2: expected a symmetric matrix, got entries that differ by 0.0001"
     )
+
+
+# Sensors
+
+TRIANGLE = [[4e-4], [1e-4, 1e-4], [0.0, 0.0, 25.0]]
+NAMES = ["gyro.bias_deg_per_h[0]", "gyro.C_bg[1][0]", "size_effect.r_mm.x[2]"]
+SENSORS: dict[str, Any] = {
+    "software": "imu50 0.2.0",
+    "captures": [{"name": "faces.raw", "sha256": "0" * 64}],
+    "procedure": "six-faces-turned",
+    "rests": [{"pose": "z-up", "start_s": 0.0, "duration_s": 60.0, "temperature_degc": 35.0}],
+    "chi_square": 63.0,
+    "degrees_of_freedom": 60,
+    "wander": {"gyro_deg_per_h": 0.002, "accelerometer_ug": 1.0},
+    "gravity": {"m_s2": 9.7917, "source": "measured", "sigma_m_s2": 1e-5},
+    "not_observable": ["accelerometer.asymmetry_ppm"],
+    "covariance": {"names": NAMES, "lower_triangle": TRIANGLE},
+}
+NOISE = {
+    "gyro": {
+        "quantisation_arcsec": [0.1, 0.1, 0.1],
+        "angle_random_walk_deg_per_sqrt_h": [0.002, 0.002, 0.002],
+        "bias_instability_deg_per_h": None,
+        "rate_random_walk_deg_per_h_per_sqrt_h": None,
+        "rate_ramp_deg_per_h_per_h": None,
+    },
+    "accelerometer": {
+        "quantisation_mm_per_s": [0.1, 0.1, 0.1],
+        "velocity_random_walk_ug_per_sqrt_hz": [5.0, 5.0, 5.0],
+        "bias_instability_ug": [1.0, 1.0, 1.0],
+        "acceleration_random_walk_ug_per_sqrt_h": None,
+        "acceleration_ramp_ug_per_h": None,
+    },
+}
+
+
+def sensors(path: str, value: Any) -> dict[str, Any]:
+    """The document with the provenance of its sensors, one value of it changed."""
+    document = copy.deepcopy(SENSORS)
+    *sections, key = path.split(".")
+    section = document
+    for name in sections:
+        section = section[name]
+    section[key] = value
+    return changed("provenance", {"sensors": document}) if path else document
+
+
+def test_a_certificate_with_every_key_of_the_sensors_is_read_back(tmp_path: Path) -> None:
+    document = copy.deepcopy(DOCUMENT)
+    document["gyro"]["frame"] = "faces"
+    document["accelerometer"] |= {
+        "quadratic_ug_per_g2": [10.0, -20.0, 30.0],
+        "asymmetry_ppm": [1.0, 2.0, 3.0],
+    }
+    document |= {"skew_ms": 0.3, "noise": NOISE, "provenance": {"sensors": SENSORS}}
+    whole = calibration(document)
+    write_calibration(tmp_path / "cal.yaml", whole)
+    assert read_calibration(tmp_path / "cal.yaml") == whole
+    assert whole.noise is not None
+    assert whole.noise.gyro.angle_random_walk_deg_per_sqrt_h == (0.002, 0.002, 0.002)
+    assert whole.sensors is not None
+    assert whole.sensors.covariance is not None
+    np.testing.assert_array_equal(
+        whole.sensors.covariance.matrix, [[4e-4, 1e-4, 0.0], [1e-4, 1e-4, 0.0], [0.0, 0.0, 25.0]]
+    )
+    assert calibration().sensors is None
+
+
+def test_a_singular_covariance_is_as_it_should_be() -> None:
+    # a row of length 1 and three arms with a common shift: rank 1 of 3, and a variance of zero
+    singular = [[1.0], [1.0, 1.0], [0.0, 0.0, 0.0]]
+    calibration(sensors("covariance.lower_triangle", singular))
+
+
+@pytest.mark.parametrize(
+    ("document", "words"),
+    [
+        (changed("skew_ms", 101.0), "skew_ms: expected at most 100"),
+        (changed("gyro.frame", "case"), "gyro.frame: expected 'gyro' or 'faces', got text 'case'"),
+        (changed("accelerometer.asymmetry_ppm", [1.0]), "accelerometer.asymmetry_ppm: expected 3 numbers"),
+        (
+            changed("accelerometer.quadratic_ug_per_g2", [0.0, 0.0, 2e4]),
+            "accelerometer.quadratic_ug_per_g2[2]",
+        ),
+        (
+            changed("noise", {"gyro": {"bias_instability_ug": [1, 1, 1]}}),
+            "noise.gyro.bias_instability_ug: unk",
+        ),
+        (changed("noise", {"gyro": {"quantisation_arcsec": [-1, 1, 1]}}), "noise.gyro.quantisation_arcsec"),
+        (
+            sensors("covariance.names", ["gyro.bias_deg_per_h[3]", *NAMES[1:]]),
+            "provenance.sensors.covariance.names: expected numbers of this certificate, such as "
+            "gyro.bias_deg_per_h[0], got gyro.bias_deg_per_h[3]",
+        ),
+        (sensors("covariance.names", [NAMES[0]] * 3), "expected each name once"),
+        (
+            sensors("covariance.lower_triangle", [[1.0], [1.0, 1.0], [1.0]]),
+            "expected a lower triangle with rows of 1 to 3 numbers, one row a name, got rows of 1, 2, 1",
+        ),
+        (
+            sensors("covariance.lower_triangle", [[1.0], [0.0, -1.0], [0.0, 0.0, 1.0]]),
+            "expected no negative variance, got -1 of gyro.C_bg[1][0]",
+        ),
+        (
+            sensors("covariance.lower_triangle", [[1.0], [1.1, 1.0], [0.0, 0.0, 1.0]]),
+            "expected correlations of at most 1, got 1.1",
+        ),
+        (
+            sensors("covariance.lower_triangle", [[1.0], [0.9, 1.0], [-0.9, 0.9, 1.0]]),
+            "expected no negative variance in any direction, got an eigenvalue of -0.8",
+        ),
+        (sensors("gravity.source", "guessed"), "provenance: sensors.gravity.source"),
+        (sensors("captures", [{"name": "a", "sha256": "1234"}]), "provenance: sensors.captures.0.sha256"),
+        (sensors("mean", 1.0), "provenance: sensors.mean"),
+    ],
+)
+def test_a_fault_in_the_keys_of_the_sensors_is_named(document: dict[str, Any], words: str) -> None:
+    assert words in fault(document)
+
+
+@pytest.mark.parametrize(
+    "path", ["skew_ms", "accelerometer.quadratic_ug_per_g2", "accelerometer.asymmetry_ppm"]
+)
+def test_terms_that_are_not_compensated_yet_are_refused_where_increments_are_made(path: str) -> None:
+    size = 0.3 if path == "skew_ms" else [1.0, 0.0, 0.0]
+    with pytest.raises(InputError, match=f"50-0017.*expected no {path}, which this version does not comp"):
+        coefficients(calibration(changed(path, size)))
+    coefficients(calibration(changed(path, 0.0 if path == "skew_ms" else [0.0, 0.0, 0.0])))
+
+
+def test_identification_begins_without_the_skew_that_it_estimates() -> None:
+    with_skew = calibration(changed("skew_ms", 0.3))
+    coefficients(with_skew.without_skew())
+    assert with_skew.without_skew() == calibration()
 
 
 # Files

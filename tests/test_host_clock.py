@@ -378,6 +378,7 @@ def wire_only(path: Path, clock: bytes | None) -> None:
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
+        writer.add_attachment(0, 0, format.PROFILE, "", profiles.content("imu50-rs422"))
         wire = writer.register_channel(format.WIRE, format.BYTES, 0)
         if clock is not None:
             writer.add_message(writer.register_channel(format.CLOCK, "json", 0), BEGIN, clock, BEGIN)

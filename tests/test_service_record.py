@@ -194,7 +194,7 @@ def test_a_request_that_the_end_overtakes_is_cancelled(tmp_path: Path) -> None:
     service.run()
     assert request.cancelled()
     assert service.record(tmp_path / "later.mcap").cancelled()
-    with pytest.raises(InputError, match="cannot read it"):
+    with pytest.raises(InputError, match="expected a file, there is none"):
         Recording(tmp_path / "late.mcap")
 
 

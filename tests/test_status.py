@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from imudrv.calibration import write_calibration
+from imudrv.cli import main as imudrv
 from imudrv.errors import InputError
 from imudrv.hostclock import now_ns
 from imudrv.profiles import load
@@ -98,6 +99,21 @@ def test_a_status_of_another_version_is_refused(tmp_path: Path) -> None:
         ask(tmp_path / "socket")
     server.close()
     assert not (tmp_path / "socket").exists()
+
+
+@pytest.mark.parametrize(
+    "change", [{"health": "good"}, {"health": []}, {"reasons": None}, {"reasons": [1]}, {"reasons": "dead"}]
+)
+def test_a_status_without_health_or_reasons_is_refused(
+    change: dict[str, object], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status = {"format": "imu50-status", "version": 1, "health": "ok", "reasons": [], **change}
+    server = StatusServer(tmp_path / "socket", lambda: json.dumps(status).encode())
+    server.start()
+    code = imudrv(["status", "--status", str(server.path)])
+    server.close()
+    assert code == 2
+    assert "expected a status with health and reasons" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("options", [[], ["--json"]])

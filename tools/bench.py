@@ -4,6 +4,7 @@
     tools/run python tools/bench.py [--rounds N] [--json]
     tools/run python tools/bench.py live|can [--seconds N] [--rounds N] [--json]
     tools/run python tools/bench.py nav [--rounds N] [--json]
+    tools/run python tools/bench.py vh [--rounds N] [--json]
 
 A capture with damaged frames passes all stages, piece by piece, in one process on one core. Absolute figures
 depend on the machine and its load; the ratios are what to look at.
@@ -27,6 +28,7 @@ import numba
 import numpy as np
 from bench_live import TRANSPORTS, live
 from bench_nav import Measure, nav
+from bench_vh import vh
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
@@ -279,7 +281,7 @@ def show(measures: list[Measure], how: str) -> None:
         column.justify = "right"
     for m in measures:
         ours, theirs = f"{m.per_second / 1e6:.1f}", f"{m.other_per_second / 1e6:.2f}"
-        table.add_row(m.stage, ours, m.other_way, theirs, f"{m.ratio:.1f}")
+        table.add_row(m.stage, ours, m.other_way, theirs, f"{m.ratio:.3g}")
     console.print(table)
     counts = ", ".join(f"{m.samples / 1e6:.1f} M and {m.other_samples / 1e6:.1f} M" for m in measures)
     console.print(f"One core, {how}, best round. Samples, own and alternative: {counts}.")
@@ -303,20 +305,20 @@ def main() -> None:
     parser.add_argument(
         "what",
         nargs="?",
-        choices=("stages", "live", "can", "nav"),
+        choices=("stages", "live", "can", "nav", "vh"),
         default="stages",
         help="default: stages of the driver",
     )
     parser.add_argument(
         "--rounds",
         type=int,
-        help="default: 12 over 5.4 minutes of samples; live 3 of each; nav 5 over an hour",
+        help="default: 12 over 5.4 minutes of samples; live 3 of each; nav 5 over an hour; vh 40",
     )
     parser.add_argument(
         "--seconds", type=int, default=20, help="duration of a live round (default: %(default)s)"
     )
     options = parser.parse_args()
-    rounds = options.rounds or {"stages": 12, "live": 3, "can": 3, "nav": 5}[options.what]
+    rounds = options.rounds or {"stages": 12, "live": 3, "can": 3, "nav": 5, "vh": 40}[options.what]
     if rounds < 1 or options.seconds < 1:
         parser.error("--rounds, --seconds: expected 1 or more")
     if options.what in TRANSPORTS:
@@ -333,6 +335,9 @@ def main() -> None:
         measures, peak_mb = nav(rounds)
         how = f"an hour in the pieces of a capture, a row a second, peak memory {peak_mb:.0f} MB"
         extra = {"peak_mb": peak_mb}
+    elif options.what == "vh":
+        measures = vh(rounds)
+        how = f"200 s of damaged bytes, {1.0 / measures[0].ratio:.2f} times the time of C"
     else:
         measures = throughput(rounds) + decode_of_others(rounds)
     if options.json:

@@ -295,6 +295,7 @@ def one_round(transport: type[Line] | type[Bus], samples: int, which: str, folde
     """Play samples through a contestant."""
     unit = transport()
     inlet = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    inlet.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 22)
     inlet.bind(("127.0.0.1", 0))
     middle = subprocess.Popen(
         command(which, unit, inlet.getsockname()[1], folder),

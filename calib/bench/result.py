@@ -116,7 +116,7 @@ def identify(
     InputError
         A recording cannot be read or lacks its rotation, or `estimate_joint` refuses.
     """
-    priors, bare = Priors(), prior_calibration.calibration.without_size_effect()
+    priors, bare = Priors(), prior_calibration.calibration.without_size_effect().without_skew()
     sources = tuple(_summarise(procedure, attempt, bare, site) for attempt in attempts)
     result = estimate_joint([run for source in sources for run in source.rotations.runs], priors)
     limits = procedure.rotation_limits(procedure.steps[0])
@@ -205,13 +205,13 @@ def _navigate(
         decoded.layout,
         calibration,
         site,
-        attempt.recording.stem,
+        attempt.step.id,
         NavigationOptions(limits, expected=attempt.step.up[1]),
     )
     if len(navigated.runs) != 1:
         reasons = "; ".join(english(reason) for _, reasons in navigated.rejected for reason in reasons)
         raise InputError(
-            f"{attempt.recording}: expected the one rotation that was accepted, got {len(navigated.runs)}: "
+            f"{attempt.recording}: expected the one run that was accepted, got {len(navigated.runs)}: "
             f"{reasons or 'no motion'}"
         )
     return navigated

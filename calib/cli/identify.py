@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Final, get_args
 
-from calib.certificate import certificate, check_target, write
+from calib.certificate import certificate, check_target, lever_arms_of, write
 from calib.cli.arguments import (
     add_certificate_output,
     add_channel,
@@ -18,11 +18,15 @@ from calib.identification import EstimationOptions, identify, prior_calibration
 from calib.lever_arms.gauge import Gauge, LeverArms, convert
 from calib.reports.identification import document, report_html
 from calib.reports.text import print_document
+from calib.reports.truth import comparison
 from calib.result_file import result_document, write_json
+from calib.signing.keys import bench_key
+from imudrv.calibration import read_calibration
 from imudrv.cli.arguments import add_profile
 from imudrv.errors import InputError
 from imudrv.files.atomic import atomic_write
-from imudrv.terminal import progress
+from imudrv.files.inputs import total_size
+from imudrv.terminal import progress, say
 
 EXAMPLE: Final = (
     "z-up.raw x-up.raw y-up.raw --profile imu50-rs422 --calibration unit.yaml --site site.yaml -o new.yaml"
@@ -53,24 +57,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_certificate_output(parser)
     add("--json", type=Path, metavar="R.json", help="the whole result as JSON")
     add("--report", type=Path, metavar="R.html", help="report with figures, one file")
+    text = "true unit of a simulation: the result is compared with it at the end, and does not depend on it"
+    add("--truth", type=Path, metavar="T.yaml", help=text)
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Identify the lever arms from captures."""
     point = known_point(arguments.at)
-    inputs = (*arguments.captures, arguments.profile, arguments.calibration, arguments.site)
+    inputs = (*arguments.captures, arguments.profile, arguments.calibration, arguments.site, arguments.truth)
     for output in filter(None, (arguments.output, arguments.json, arguments.report)):
         check_output(output, *inputs)
     prior = prior_calibration(arguments.captures, arguments.calibration, arguments.unit)
     check_target(arguments.output, prior.calibration)
+    key = bench_key()
     options = EstimationOptions(
         arguments.method,
         arguments.pivot,
         nine=arguments.gauge == "given" and point is None,
         extra=(arguments.estimate,) if arguments.estimate else (),
     )
-    size = sum(path.stat().st_size for path in arguments.captures if path.exists())
-    with progress("identify", 2 * size) as advance:  # each capture is read twice
+    with progress("identify", total_size(arguments.captures * 2)) as advance:  # each is read twice
         result = identify(
             arguments.captures,
             site=arguments.site,
@@ -91,11 +97,14 @@ def run(arguments: argparse.Namespace) -> None:
             with atomic_write(arguments.report) as file:
                 file.write(report_html(result, gauges).encode())
             written.append(f"{arguments.report}: the report")
-        write(arguments.output, certificate(result, arms))
+        write(arguments.output, certificate(result, arms), key)
         written.append(written_text(arguments.output, prior.calibration, arms))
     finally:
         print_document(document(result, gauges))
-        print(*written, sep="\n")
+        say("\n".join(written))
+    if arguments.truth is not None:
+        true = lever_arms_of(read_calibration(arguments.truth), str(arguments.truth))
+        print_document(comparison(arms, true, arguments.truth.name))
 
 
 def _in_gauge(arms: LeverArms, gauge: Gauge | None, point: tuple[str, list[float]] | None) -> LeverArms:

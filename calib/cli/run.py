@@ -4,12 +4,11 @@ import argparse
 from pathlib import Path
 from typing import Final
 
-from rich.console import Console
-
 from calib.bench.run import RunOptions, new_folder
 from calib.bench.run import run as run_session
 from calib.procedure import plan
 from imudrv.cli.arguments import add_profile
+from imudrv.terminal import console
 
 EXAMPLE: Final = (
     "--port /dev/ttyUSB0 --profile imu50-rs422 --calibration unit.yaml --site site.yaml --session s1"
@@ -29,6 +28,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--session", dest="folder", type=Path, default=new_folder(), metavar="DIR", help=text)
     text = "repeat this step of an existing session; may be given several times"
     add("--redo", action="append", default=[], metavar="STEP", help=text)
+    add(
+        "--plan",
+        action="store_true",
+        help="only show the steps, how long they take, and the expected accuracy",
+    )
     add("--hands-free", action="store_true", help="continue by the sensors alone, without keys")
     add("--rehearse", action="store_true", help="use a simulated unit and technician")
     add("--speed", default="1", metavar="X", help="speed of the rehearsal: 1, 10, ... or max")
@@ -36,4 +40,4 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run or resume a session at the bench."""
-    return run_session(RunOptions(**vars(arguments)), Console())
+    return run_session(RunOptions(**vars(arguments)), console())

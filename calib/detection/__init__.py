@@ -5,4 +5,5 @@ noise       noise of the sensors from rests
 segments    rests and rotations of a capture
 tracking    the same online
 acceptance  limits of a rotation and reasons for rejection
+turns       runs: turns in one pose after one alignment
 """

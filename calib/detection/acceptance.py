@@ -3,9 +3,9 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from math import hypot, inf
-from typing import Final, NamedTuple
+from typing import Final
 
-from calib.detection.segments import Rest, Rotation
+from calib.detection.segments import Rotation
 from calib.messages import Message, message
 from imudrv.records import Flag
 from imudrv.units import STANDARD_GRAVITY, UG, URAD
@@ -27,7 +27,7 @@ class RotationLimits:
     axis_tilt_deg : float
         Maximum angle between the axis and the vertical.
     rest_before_s, rest_after_s : float
-        Minimum rests: for alignment and velocity before, for velocity after.
+        Minimum rests: for alignment and velocity before, for velocity after: 3 s, less the ends of the turns.
     missing : int
         Maximum number of samples missing during the rotation.
     """
@@ -37,33 +37,8 @@ class RotationLimits:
     least_peak_deg_per_s: float = 70.0
     axis_tilt_deg: float = 10.0
     rest_before_s: float = 32.0
-    rest_after_s: float = 5.0
+    rest_after_s: float = 2.8
     missing: int = 0
-
-
-@dataclass(frozen=True)
-class AcceptedRotation(Rotation):
-    """A rotation within the limits; it has a rest before and after it."""
-
-    before: Rest
-    after: Rest
-
-
-class RejectedRotation(NamedTuple):
-    """A motion that is outside the limits, and the reasons."""
-
-    rotation: Rotation
-    reasons: tuple[Message, ...]
-
-
-def assess(
-    rotation: Rotation, limits: RotationLimits, expected: str | None = None
-) -> AcceptedRotation | RejectedRotation:
-    """Accept or reject a motion as a rotation of the procedure; see `rejection_reasons`."""
-    reasons = rejection_reasons(rotation, limits, expected)
-    if reasons or rotation.before is None or rotation.after is None:
-        return RejectedRotation(rotation, reasons)
-    return AcceptedRotation(**vars(rotation))
 
 
 def rejection_reasons(

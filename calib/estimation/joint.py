@@ -41,7 +41,7 @@ from calib.estimation.linear_system import (
     run_result,
     singular_values_of,
     unobservable_text,
-    velocity_gain,
+    velocity_gains,
 )
 from calib.estimation.result import (
     CENTROID_BASIS,
@@ -128,7 +128,6 @@ def estimate_joint(
         ParameterEstimate(name, float(value), float(s), float(prior))
         for name, value, s, prior in zip(names, x[9:], spread[9:], system.parameters.sigma, strict=True)
     )
-    gains = [velocity_gain(run) for run in runs]
     return LeverArmEstimate(
         method="joint",
         gauge="given" if pivot == "fixed" else "centroid",
@@ -136,7 +135,7 @@ def estimate_joint(
         covariance=covariance[:9, :9],
         rank=rank,
         direction_sigma=sigma,
-        singular_values=singular_values_of(gains),
+        singular_values=singular_values_of(velocity_gains(runs)),
         reason=rank_reason(rank, sigma, priors.arm),
         chi_square=chi_square,
         degrees_of_freedom=freedom,
@@ -147,7 +146,7 @@ def estimate_joint(
             _without(system, k, run.label, x, basis, priors.arm) for k, run in enumerate(runs)
         ),
         runs=tuple(
-            run_result(run, *gains[k], x[:9], part.t_s, part.v_n, part.columns @ x[system.columns_of(k)])
+            run_result(run, x[:9], part.t_s, part.v_n, part.columns @ x[system.columns_of(k)])
             for k, (run, part) in enumerate(zip(runs, system.parts, strict=True))
         ),
         notes=tuple(

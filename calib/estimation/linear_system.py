@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation as Attitude
 from calib.detection.blocks import BLOCK_NS
 from calib.detection.noise import BIN_S, Noise, pooled_noise
 from calib.detection.segments import Rest
-from calib.estimation.result import Extra, RunResult
+from calib.estimation.result import Extra, RunResult, TurnResult
 from calib.estimation.runs import Priors, Run
 from imudrv.arrays import Array
 from imudrv.errors import InputError
@@ -163,13 +163,14 @@ def prior_parameters(runs: Sequence[Run], priors: Priors, terms: Sequence[str]) 
 
 def rest_noise(runs: Sequence[Run]) -> Noise:
     """Return the noise of all rests of the runs, each counted once."""
-    rests = {
-        (run.label.rpartition("#")[0], rest.start): rest
-        for run in runs
-        for rest in (run.rotation.before, run.rotation.after)
-    }
+    rests = {(run.label.partition("#")[0], rest.start): rest for run in runs for rest in rests_of(run)}
     found = vars(pooled_noise(rest.differences for rest in rests.values()))
     return Noise(**{name: max(value, getattr(LEAST_NOISE, name)) for name, value in found.items()})
+
+
+def rests_of(run: Run) -> list[Rest]:
+    """Return the rest of each arrest."""
+    return [run.turns[0].before, *(turn.after for turn in run.turns)]
 
 
 def bin_variance(rest: Rest, noise: Noise) -> float:
@@ -228,7 +229,7 @@ def _skew_column(run: Run, C_nb: Array, f_n: Array, f_b: Array) -> Array:
     At rest the first two cancel. In motion f_n is the mean of the adjacent rows, because a row's own noise is
     also in its velocity.
     """
-    moving = ~(run.before | run.after)
+    moving = ~run.at_rest
     column = -np.cumsum(np.einsum("nij,nj->ni", np.diff(C_nb, axis=0, prepend=C_nb[:1]), f_b), axis=0)
     later = np.concatenate([f_n[1:], f_n[-1:]])
     column[moving] += 0.5 * (f_n + later)[moving] - [0.0, 0.0, run.gravity]
@@ -238,15 +239,14 @@ def _skew_column(run: Run, C_nb: Array, f_n: Array, f_b: Array) -> Array:
 def _settled_H(run: Run, coriolis: Array) -> Array:
     """Return H of each row, at rest without the noise of the rate at a row's end.
 
-    At rest H is constant except for the Coriolis acceleration; before the motion it is zero. That noise, up
-    to 2e-3 m/s per metre in a single row, would look like a signal of the gauge.
+    At rest H is constant except for the Coriolis acceleration; before the first turn it is zero. That noise,
+    up to 2e-3 m/s per metre in a single row, would look like a signal of the gauge.
     """
     H = run.rows["H"].copy()
-    H[run.before] = 0.0
-    t = run.t_s[run.after]
-    H[run.after] = H[run.after].mean(axis=0) - (t - t.mean())[:, None, None] * (
-        coriolis @ H[run.after].mean(axis=0)
-    )
+    H[run.arrests[0]] = 0.0
+    for at in run.arrests[1:]:
+        t, mean = run.t_s[at], H[at].mean(axis=0)
+        H[at] = mean - (t - t.mean())[:, None, None] * (coriolis @ mean)
     return H
 
 
@@ -260,24 +260,28 @@ def _tilted(phi: Array, gravity: float) -> Array:
 def run_equations(run: Run, noise: Noise, pivot: str, terms: Sequence[str]) -> RunEquations:
     """Return the equations of the rests; with a known pivot also of the motion and the vertical."""
     parts = 3 if pivot == "fixed" else 2
-    rows = [whole_bins(run.before, True), whole_bins(run.after, False)]
+    rows = arrest_bins(run)
+    single = [bin_variance(rest, noise) for rest in rests_of(run)]
     if pivot == "fixed":
-        rows.insert(1, np.flatnonzero(~(run.before | run.after))[::ROWS_PER_POINT, None])
+        rows.append(np.flatnonzero(~run.at_rest)[::ROWS_PER_POINT, None])
+        single.append(noise.velocity_pulse**2)
     columns = design_columns(run, terms)[:, :parts]
 
     def mean(x: Array) -> Array:
         return np.concatenate([x[at].mean(axis=1) for at in rows])
 
-    v_n = np.where((run.before | run.after)[:, None], run.v_n, run.rows["v_n"])[:, :parts]
+    v_n = np.where(run.at_rest[:, None], run.v_n, run.rows["v_n"])[:, :parts]
     t, v, A = mean(run.t_s), mean(v_n), mean(columns)
-    single = [bin_variance(rest, noise) for rest in (run.rotation.before, run.rotation.after)]
-    if pivot == "fixed":
-        single.insert(1, noise.velocity_pulse**2)
     own = np.repeat(single, [len(at) for at in rows])
     L = np.linalg.cholesky(noise_covariance(t, own, noise, run.gravity))
     white_A = solve_triangular(L, A.reshape(len(t), -1), lower=True).reshape(-1, A.shape[2])
     white_v = solve_triangular(L, v, lower=True).ravel()
     return RunEquations(t, v, A, white_A.T @ white_A, white_A.T @ white_v, float(white_v @ white_v))
+
+
+def arrest_bins(run: Run) -> list[NDArray[np.int64]]:
+    """Return the rows of the bins of each arrest, (bins, rows per bin)."""
+    return [whole_bins(at, from_the_end=k == 0) for k, at in enumerate(run.arrests)]
 
 
 def whole_bins(mask: NDArray[np.bool_], from_the_end: bool) -> NDArray[np.int64]:
@@ -288,23 +292,28 @@ def whole_bins(mask: NDArray[np.bool_], from_the_end: bool) -> NDArray[np.int64]
     return at.reshape(-1, ROWS_PER_BIN)
 
 
-def velocity_gain(run: Run) -> tuple[Array, Array]:
-    """Return the gains V and H of a rotation: means over the half second after minus those before."""
-    before, after = gain_rows(run)
+def velocity_gain(run: Run, k: int = 0) -> tuple[Array, Array]:
+    """Return the gains V and H of turn k: means over the half second after minus those before."""
+    before, after = gain_rows(run, k)
     rows = run.rows
     V = run.v_n[after].mean(axis=0) - run.v_n[before].mean(axis=0)
     return V, rows["H"][after].mean(axis=0) - rows["H"][before].mean(axis=0)
 
 
-def gain_rows(run: Run) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the rows of the half second before a rotation and of that after it."""
+def velocity_gains(runs: Sequence[Run]) -> list[tuple[Array, Array]]:
+    """Return the gains V and H of all accepted turns."""
+    return [velocity_gain(run, k) for run in runs for k, turn in enumerate(run.turns) if turn.accepted]
+
+
+def gain_rows(run: Run, k: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the rows of the half second before turn k and of that after it."""
     n = round(GAIN_WINDOW_S / (BLOCK_NS * NS))
-    return np.flatnonzero(run.before)[-n:], np.flatnonzero(run.after)[:n]
+    return np.flatnonzero(run.arrests[k])[-n:], np.flatnonzero(run.arrests[k + 1])[:n]
 
 
 def velocity_at_rest(run: Run, R: Array) -> tuple[Array, Array, Array]:
     """Return times, velocities and H R of the bins at rest."""
-    at = np.concatenate([whole_bins(run.before, True), whole_bins(run.after, False)])
+    at = np.concatenate(arrest_bins(run))
     rows = run.rows[at]
     return (
         run.t_s[at].mean(axis=1),
@@ -313,14 +322,16 @@ def velocity_at_rest(run: Run, R: Array) -> tuple[Array, Array, Array]:
     )
 
 
-def run_result(run: Run, V: Array, H: Array, R: Array, t_s: Array, v_n: Array, fitted_n: Array) -> RunResult:
-    """Return the result of one rotation."""
-    H_rest = run.rows["H"][gain_rows(run)[0], :2].mean(axis=0)
+def run_result(run: Run, R: Array, t_s: Array, v_n: Array, fitted_n: Array) -> RunResult:
+    """Return the result of one run."""
+    H_rest = run.rows["H"][gain_rows(run, 0)[0], :2].mean(axis=0)
+    turns = []
+    for k, (turn, label) in enumerate(zip(run.turns, run.turn_labels, strict=True)):
+        V, H = velocity_gain(run, k)
+        turns.append(TurnResult(label, turn.accepted, V, H, V - H @ R))
     return RunResult(
         run.label,
-        V,
-        H,
-        V - H @ R,
+        tuple(turns),
         float(np.abs(H_rest).max()),
         t_s,
         v_n[:, :2],

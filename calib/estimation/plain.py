@@ -3,12 +3,13 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg import block_diag, solve_triangular
 
 from calib.detection.noise import Noise
 from calib.estimation.linear_system import (
     ROUNDING,
     Parameters,
+    arrest_bins,
     bin_variance,
     design_columns,
     gain_rows,
@@ -18,12 +19,12 @@ from calib.estimation.linear_system import (
     rank_reason,
     require_runs,
     rest_noise,
+    rests_of,
     run_result,
     singular_values_of,
     unobservable_text,
     velocity_at_rest,
-    velocity_gain,
-    whole_bins,
+    velocity_gains,
 )
 from calib.estimation.result import CENTROID_BASIS, LeverArmEstimate
 from calib.estimation.runs import Priors, Run
@@ -60,7 +61,7 @@ def estimate_plain(runs: Sequence[Run], priors: Priors | None = None) -> LeverAr
     noise = rest_noise(runs)
     terms = parameter_groups(priors, ())
     parameters = prior_parameters(runs, priors, terms)
-    gains = [velocity_gain(run) for run in runs]
+    gains = velocity_gains(runs)
     V = np.concatenate([v[:2] for v, _ in gains])
     H = np.concatenate([h[:2] for _, h in gains])
     S = _plain_covariance(runs, noise, parameters, terms)
@@ -91,10 +92,7 @@ def estimate_plain(runs: Sequence[Run], priors: Priors | None = None) -> LeverAr
         parameters=(),
         correlation=np.zeros((9, 0)),
         leave_one_out=(),
-        runs=tuple(
-            run_result(run, *gain, R, *velocity_at_rest(run, R))
-            for run, gain in zip(runs, gains, strict=True)
-        ),
+        runs=tuple(run_result(run, R, *velocity_at_rest(run, R)) for run in runs),
         notes=(),
     )
 
@@ -110,24 +108,25 @@ def _plain_covariance(
     information = np.diag(
         np.concatenate([np.full(9, 1e12), parameters.sigma**-2])
     )  # R has no effect before the rotation
-    rows = []
-    S = np.zeros((2 * len(runs), 2 * len(runs)))
+    rows, blocks = [], []
     for k, run in enumerate(runs):
         at = parameters.columns_of(k, len(runs))
-        still = whole_bins(run.before, True)
+        still = arrest_bins(run)[0]
         columns = design_columns(run, terms)[:, :2]
         A, t = columns[still].mean(axis=1), run.t_s[still].mean(axis=1)
-        single = [bin_variance(rest, noise) for rest in (run.rotation.before, run.rotation.after)]
+        single = [bin_variance(rest, noise) for rest in rests_of(run)]
         K = noise_covariance(t, np.full(len(t), single[0]), noise, run.gravity)
         white = solve_triangular(np.linalg.cholesky(K), A.reshape(len(t), -1), lower=True)
         white = white.reshape(-1, A.shape[2])
         information[np.ix_(at, at)] += white.T @ white
-        before, after = gain_rows(run)
-        row = np.zeros((2, len(information)))
-        row[:, at] = columns[after].mean(axis=0) - columns[before].mean(axis=0)
-        rows.append(row)
-        t = np.array([run.t_s[before].mean(), run.t_s[after].mean()])
-        K = noise_covariance(t, np.array(single), noise, run.gravity)
-        S[2 * k, 2 * k] = S[2 * k + 1, 2 * k + 1] = K[0, 0] + K[1, 1] - 2.0 * K[0, 1]
+        accepted = [j for j, turn in enumerate(run.turns) if turn.accepted]
+        windows = [(j + later, at) for j in accepted for later, at in enumerate(gain_rows(run, j))]
+        row = np.zeros((len(windows), 2, len(information)))
+        row[:, :, at] = [columns[rows_at].mean(axis=0) for _, rows_at in windows]
+        rows.append((row[1::2] - row[::2]).reshape(-1, row.shape[2]))
+        t = np.array([run.t_s[at].mean() for _, at in windows])
+        K = noise_covariance(t, np.array([single[j] for j, _ in windows]), noise, run.gravity)
+        gains = K[1::2, 1::2] - K[1::2, ::2] - K[::2, 1::2] + K[::2, ::2]
+        blocks.append(np.kron(gains, np.eye(2)))
     stacked = np.concatenate(rows)
-    return S + stacked @ np.linalg.solve(information, stacked.T)
+    return np.asarray(block_diag(*blocks) + stacked @ np.linalg.solve(information, stacked.T), np.float64)

@@ -9,10 +9,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation as Attitude
 
 from calib.axes import Side, vector
-from calib.detection.acceptance import AcceptedRotation
 from calib.detection.blocks import BLOCK_NS
 from calib.detection.noise import Noise
 from calib.detection.segments import Rest
+from calib.detection.turns import Turn
 from calib.estimation.linear_system import (
     GAIN_WINDOW_S,
     NormalEquations,
@@ -37,7 +37,7 @@ _PLAN_INTERVAL_NS: Final = 5_000_000
 
 @dataclass(frozen=True)
 class PlannedRotation:
-    """A planned rotation.
+    """One run of a plan: a turn, or several after one alignment.
 
     Attributes
     ----------
@@ -48,9 +48,13 @@ class PlannedRotation:
     duration_s : float
         Duration from rest to rest, with minimum jerk.
     after_s : float
-        Duration of the rest after it.
+        Duration of the rest after each turn.
     offset_m : float
         Distance of the origin of b from the rotation axis; the effect of a skew is proportional to it.
+    turns : int
+        Number of turns after one alignment.
+    alternate : bool
+        Whether every second turn is back.
     """
 
     up: Side
@@ -58,6 +62,8 @@ class PlannedRotation:
     duration_s: float = 2.5
     after_s: float = 15.0
     offset_m: float = 0.05
+    turns: int = 1
+    alternate: bool = True
 
 
 @dataclass(frozen=True, repr=False)
@@ -131,14 +137,19 @@ def _planned_run(planned: PlannedRotation, k: int, latitude_rad: float, priors: 
     """Return the ideal run of a planned rotation: level, about the vertical, without errors."""
     T, n = _PLAN_INTERVAL_NS * NS, round(planned.duration_s / (_PLAN_INTERVAL_NS * NS))
     before, after = round(BEFORE_S / T), round(min(planned.after_s, AFTER_S) / T)
-    if planned.up not in get_args(Side) or n < 1 or after * T < GAIN_WINDOW_S:
+    if planned.up not in get_args(Side) or n < 1 or planned.turns < 1 or after * T < GAIN_WINDOW_S:
         raise InputError(
-            f"plan: expected an axis up from +X to -Z, a duration, and a rest of at "
+            f"plan: expected an axis up from +X to -Z, a duration, turns, and a rest of at "
             f"least {GAIN_WINDOW_S:g} s, got {planned}"
         )
     up_b = vector(planned.up)
-    u = np.clip((np.arange(before + n + after + 1) - before) / n, 0.0, 1.0)
-    angle = planned.angle_deg * DEG * u**3 * (10.0 - 15.0 * u + 6.0 * u * u)
+    starts = before + (n + after) * np.arange(planned.turns)
+    samples = np.arange(before + (n + after) * planned.turns + 1)
+    angle = np.zeros(len(samples))
+    for k, start in enumerate(starts):
+        u = np.clip((samples - start) / n, 0.0, 1.0)
+        sign = -1.0 if planned.alternate and k % 2 else 1.0
+        angle += sign * planned.angle_deg * DEG * u**3 * (10.0 - 15.0 * u + 6.0 * u * u)
     gravity = normal_gravity(latitude_rad, 0.0)
     C_nb0 = Attitude.align_vectors([[0.0, 0.0, 1.0]], [up_b])[0]
     turned = Attitude.from_rotvec(np.outer(angle, [0.0, 0.0, 1.0]))
@@ -161,29 +172,35 @@ def _planned_run(planned: PlannedRotation, k: int, latitude_rad: float, priors: 
         tan(latitude_rad) * priors.accelerometer_bias / gravity,
     )
     rest = Rest(0, before, 0.0, before * T, 0, planned.up, up_b, None)
-    rotation = AcceptedRotation(
-        before,
-        before + n,
-        before * T,
-        (before + n) * T,
-        missing=0,
-        before=rest,
-        after=rest,
-        angle_deg=planned.angle_deg,
-        axis=planned.up,
-        about=planned.up[1],
-        axis_tilt_deg=0.0,
-        peak_deg_per_s=0.0,
-        flags=0,
+    turns = tuple(
+        Turn(
+            start,
+            start + n,
+            start * T,
+            (start + n) * T,
+            missing=0,
+            before=rest,
+            after=rest,
+            angle_deg=planned.angle_deg,
+            axis=planned.up,
+            about=planned.up[1],
+            axis_tilt_deg=0.0,
+            peak_deg_per_s=0.0,
+            flags=0,
+            reasons=(),
+        )
+        for start in starts.tolist()
     )
+    counter = rows["counter"]
+    begins = [0, *(turn.stop + guard for turn in turns)]
+    ends = [*(turn.start - guard for turn in turns), len(increments)]
     return Run(
         f"plan#{k + 1}",
-        rotation,
+        turns,
         Aligned(0, 0, q_nb, ALIGNMENT_S, level, heading, None),
         gravity,
         rows,
         rows["v_n"],
         (rows["counter"] + 1) * T,
-        rows["counter"] < before - guard,
-        rows["counter"] >= before + n + guard,
+        np.array([(begin <= counter) & (counter < end) for begin, end in zip(begins, ends, strict=True)]),
     )

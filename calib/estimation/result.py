@@ -61,23 +61,43 @@ class ParameterEstimate:
 
 
 @dataclass(frozen=True)
+class TurnResult:
+    """Velocity that one turn gained.
+
+    Attributes
+    ----------
+    label : str
+        Label of the turn.
+    accepted : bool
+        Whether the turn is within its limits.
+    V_n : ndarray, shape (3,)
+        Mean velocity over half a second after the turn minus that before it, east, north, up, m/s.
+    H : ndarray, shape (3, 9)
+        The same difference of the measurement matrix.
+    compensated_n : ndarray, shape (3,)
+        `V_n - H R`.
+    """
+
+    label: str
+    accepted: bool
+    V_n: Array
+    H: Array
+    compensated_n: Array
+
+
+@dataclass(frozen=True)
 class RunResult:
-    """Velocity of one rotation and its fit.
+    """Velocity of one run and its fit.
 
     Attributes
     ----------
     label : str
         Label of the run.
-    V_n : ndarray, shape (3,)
-        Velocity gain of the rotation: mean over half a second after it minus that before it, east, north,
-        up, m/s.
-    H : ndarray, shape (3, 9)
-        The same difference of the measurement matrix.
-    compensated_n : ndarray, shape (3,)
-        `V_n - H R`.
+    turns : tuple of TurnResult
+        Its turns.
     H_rest : float
-        Largest horizontal element of H at the end of the rest before, m/s per m: 0 in theory. The squared
-        rates rectify residual dither or vibration in the gyros' increments, which makes it grow.
+        Largest horizontal element of H at the end of the rest before the first turn, m/s per m: 0 in theory.
+        The squared rates rectify residual dither or vibration in the gyros' increments, which makes it grow.
     t_s : ndarray, shape (n,)
         Middle of each bin at rest, from the start of navigation.
     v_n, fitted_n : ndarray, shape (n, 2)
@@ -85,9 +105,7 @@ class RunResult:
     """
 
     label: str
-    V_n: Array
-    H: Array
-    compensated_n: Array
+    turns: tuple[TurnResult, ...]
     H_rest: float
     t_s: Array
     v_n: Array
@@ -146,7 +164,7 @@ class LeverArmEstimate:
     leave_one_out : tuple of LeaveOneOut
         The estimate without each rotation in turn.
     runs : tuple of RunResult
-        Each rotation.
+        Each run.
     notes : tuple of str
         Remarks for the reader.
     """
@@ -172,6 +190,11 @@ class LeverArmEstimate:
     def arms(self) -> LeverArms:
         """The lever arms with covariance and gauge."""
         return LeverArms(self.R_b, self.covariance, self.gauge)
+
+    @property
+    def turns(self) -> tuple[TurnResult, ...]:
+        """The turns of all runs."""
+        return tuple(turn for run in self.runs for turn in run.turns)
 
     @property
     def sigma(self) -> Array:

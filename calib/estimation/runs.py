@@ -1,9 +1,11 @@
-"""Align and navigate each accepted rotation: velocity and its measurement matrices.
+"""Align and navigate each run: velocity and its measurement matrices.
 
-Each rotation is one run. It is aligned on the rest before it, except the last seconds of that rest, then
-navigated from zero velocity through the end of that rest, the rotation, and the rest after. The dither of the
-gyro blocks is filtered from the angle increments. A capture is read twice: the first pass finds the segments,
-the second aligns and navigates, so that memory holds one chunk and the rows kept.
+A run is one or more turns after one alignment. It is aligned on the rest before its first turn, except the
+last seconds of that rest, then navigated from zero velocity through the end of that rest and through all
+turns with the rests between and after them: arrest 0 is the rest before the first turn, arrest k the one
+after turn k. The dither of the gyro blocks is filtered from the angle increments. A capture is read twice:
+the first pass finds the segments, the second aligns and navigates, so that memory holds one chunk and the
+rows kept.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -13,9 +15,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calib.detection.acceptance import AcceptedRotation, RejectedRotation, RotationLimits, assess
+from calib.detection.acceptance import RotationLimits
 from calib.detection.blocks import BLOCK_NS
 from calib.detection.segments import Segments, find_segments
+from calib.detection.turns import RejectedRotation, Turn, find_runs
 from calib.estimation.low_pass import without_dither
 from imudrv.arrays import Array
 from imudrv.calibration import Calibration, coefficients
@@ -29,15 +32,15 @@ from imudrv.units import DEG_PER_H, MM, NS, PPM, STANDARD_GRAVITY, UG, URAD
 from imudrv.wire.layout import Layout
 
 BEFORE_S: Final = 10.0
-"""Length of the rest before the rotation that is navigated, s."""
+"""Length of the rest before the first turn that is navigated, s."""
 
 
 AFTER_S: Final = 15.0
-"""Maximum length of the rest after the rotation that is navigated, s."""
+"""Maximum length of the rest after the last turn that is navigated, s."""
 
 
 GUARD_S: Final = 0.1
-"""Margin of each rest next to the rotation that is not used, s: a rotation ends too slowly."""
+"""Margin of each rest next to a turn that is not used, s: a turn ends too slowly."""
 
 
 @dataclass(frozen=True)
@@ -71,14 +74,14 @@ class Priors:
 
 @dataclass(frozen=True)
 class Run:
-    """One rotation, navigated.
+    """Turns after one alignment, navigated.
 
     Attributes
     ----------
     label : str
-        Capture and number of the rotation in it.
-    rotation : AcceptedRotation
-        The rotation and the rests before and after it.
+        Name of the capture, with the number of the run where the capture has several.
+    turns : tuple of Turn
+        The turns and the rests before and after them.
     aligned : Aligned
         Initial alignment.
     gravity : float
@@ -90,19 +93,30 @@ class Run:
         accelerometer, 20 to 100 per second, would alias into single values.
     t_s : ndarray, shape (n,)
         Time of each row from the start of navigation, by the counter.
-    before, after : ndarray of bool, shape (n,)
-        Rows at rest before and after the rotation.
+    arrests : ndarray of bool, shape (turns + 1, n)
+        Rows at rest: before the first turn, after the first, after the second, ...
     """
 
     label: str
-    rotation: AcceptedRotation
+    turns: tuple[Turn, ...]
     aligned: Aligned
     gravity: float
     rows: Records
     v_n: Array
     t_s: Array
-    before: NDArray[np.bool_]
-    after: NDArray[np.bool_]
+    arrests: NDArray[np.bool_]
+
+    @property
+    def turn_labels(self) -> tuple[str, ...]:
+        """Label of each turn: `z-up/1`, `z-up/2`, ...; that of the run if it is the only one."""
+        if len(self.turns) == 1:
+            return (self.label,)
+        return tuple(f"{self.label}/{k + 1}" for k in range(len(self.turns)))
+
+    @property
+    def at_rest(self) -> NDArray[np.bool_]:
+        """Rows of all arrests, shape (n,)."""
+        return np.asarray(self.arrests.any(axis=0), np.bool_)
 
 
 @dataclass(frozen=True)
@@ -114,9 +128,9 @@ class CaptureRuns:
     segments : Segments
         All rests and rotations.
     runs : tuple of Run
-        The accepted rotations, navigated.
+        The runs, navigated; each has an accepted turn.
     rejected : tuple of RejectedRotation
-        The other motions, with the reasons.
+        The motions that are not accepted, with the reasons.
     """
 
     segments: Segments
@@ -150,7 +164,7 @@ def navigate_rotations(
     label: str = "",
     options: NavigationOptions | None = None,
 ) -> CaptureRuns:
-    """Find the rotations of a capture and navigate the accepted ones.
+    """Find the runs of a capture and navigate them.
 
     Parameters
     ----------
@@ -177,20 +191,17 @@ def navigate_rotations(
     """
     options = options or NavigationOptions()
     segments = find_segments(without_dither(read()))
-    builders: list[_RunBuilder] = []
-    rejected: list[RejectedRotation] = []
-    for rotation in segments.rotations:
-        assessed = assess(rotation, options.limits, options.expected)
-        if isinstance(assessed, RejectedRotation):
-            rejected.append(assessed)
-        else:
-            name = f"{label}#{len(builders) + 1}"
-            builders.append(_RunBuilder(name, assessed, segments.interval_s, C_ba, site, options.priors))
+    found = find_runs(segments.rotations, options.limits, options.expected)
+    labels = [label] if len(found.runs) == 1 else [f"{label}#{k + 1}" for k in range(len(found.runs))]
+    builders = [
+        _RunBuilder(name, turns, segments.interval_s, C_ba, site, options.priors)
+        for name, turns in zip(labels, found.runs, strict=True)
+    ]
     if builders:
         for piece in without_dither(read()):
             for builder in builders:
                 builder.feed(piece)
-    return CaptureRuns(segments, tuple(builder.result() for builder in builders), tuple(rejected))
+    return CaptureRuns(segments, tuple(builder.result() for builder in builders), found.rejected)
 
 
 def navigate_capture(
@@ -235,25 +246,26 @@ def navigate_capture(
 
 
 class _RunBuilder:
-    """Aligns and navigates one rotation from the pieces of its capture."""
+    """Aligns and navigates one run from the pieces of its capture."""
 
     def __init__(
         self,
         label: str,
-        rotation: AcceptedRotation,
+        turns: tuple[Turn, ...],
         interval_s: float,
         C_ba: ArrayLike,
         site: Site,
         priors: Priors,
     ) -> None:
-        self._label, self._rotation, self._interval_s = label, rotation, interval_s
+        self._label, self._turns, self._interval_s = label, turns, interval_s
         self._C_ba, self._site = C_ba, site
-        rest_s = rotation.before.duration_s
+        first, last = turns[0], turns[-1]
+        rest_s = first.before.duration_s
         navigated_s = min(BEFORE_S, rest_s - MIN_ALIGNMENT_S)
         aligned_s = min(ALIGNMENT_S, rest_s - navigated_s)
-        self._begin = rotation.start - round(navigated_s / interval_s)
+        self._begin = first.start - round(navigated_s / interval_s)
         self._first = self._begin - round(aligned_s / interval_s)  # counter of the first sample needed
-        self._stop = min(rotation.after.stop, rotation.stop + round(AFTER_S / interval_s))
+        self._stop = min(last.after.stop, last.stop + round(AFTER_S / interval_s))
         self._alignment = Alignment(site.latitude_rad, priors.gyro_bias, priors.accelerometer_bias, aligned_s)
         self._started: tuple[Aligned, Navigator] | None = None
         self._every = max(1, round(BLOCK_NS * NS / interval_s))
@@ -276,24 +288,24 @@ class _RunBuilder:
             self._navigated += len(rows)
 
     def result(self) -> Run:
-        """Return the navigated rotation."""
+        """Return the navigated run."""
         if self._started is None:
             raise InputError(
-                f"{self._label}: expected the same samples in both passes, got none of this rotation in the "
-                "second"
+                f"{self._label}: expected the same samples in both passes, got none of this run in the second"
             )
         rows = np.concatenate(self._rows)
         v_n = np.concatenate(self._v_n)[: len(rows) * self._every]
         counter = rows["counter"]
         guard = round(GUARD_S / self._interval_s)
+        begins = [self._begin, *(turn.stop + guard for turn in self._turns)]
+        ends = [*(turn.start - guard for turn in self._turns), self._stop]
         return Run(
             self._label,
-            self._rotation,
+            self._turns,
             self._started[0],
             self._site.gravity,
             rows,
             v_n.reshape(len(rows), self._every, 3).mean(axis=1),
             (counter + 1 - self._begin) * self._interval_s,
-            before=counter < self._rotation.start - guard,
-            after=counter >= self._rotation.stop + guard,
+            np.array([(begin <= counter) & (counter < end) for begin, end in zip(begins, ends, strict=True)]),
         )

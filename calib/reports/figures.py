@@ -3,11 +3,12 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from io import BytesIO
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from calib.estimation.result import RunResult
+from calib.estimation.result import RunResult, TurnResult
 from calib.estimation.runs import Run
 from imudrv.arrays import Array
 from imudrv.units import MM
@@ -116,7 +117,7 @@ def velocities(run: Run, result: RunResult) -> bytes:
     Parameters
     ----------
     run : Run
-        The run, for the time of its rotation.
+        The run, for the times of its turns.
     result : RunResult
         Estimate for that run.
 
@@ -125,52 +126,53 @@ def velocities(run: Run, result: RunResult) -> bytes:
     bytes
         SVG.
     """
-    turned = (float(run.t_s[run.before][-1]), float(run.t_s[run.after][0]))
-    before = result.t_s < turned[0]
+    rests = [(float(run.t_s[at][0]), float(run.t_s[at][-1])) for at in run.arrests]
     with _drawing(2.2) as (figure, svg):
         left, right = figure.subplots(1, 2)
         for k, name in enumerate(("east", "north")):
             v, fitted = result.v_n[:, k] / MM, result.fitted_n[:, k] / MM
             left.plot(result.t_s, v, ".", color=_COLOURS[k], markersize=3, label=name)
-            for part in (before, ~before):
+            for begin, end in rests:
+                part = (result.t_s >= begin) & (result.t_s <= end)
                 left.plot(result.t_s[part], fitted[part], color=_COLOURS[k], alpha=0.6)
             right.plot(result.t_s, v - fitted, ".", color=_COLOURS[k], markersize=3)
         left.set(title="velocity at rest (points), estimate (lines)", ylabel="mm/s")
         right.set(title="residuals", ylabel="mm/s")
         for axes in (left, right):
-            axes.axvspan(*turned, color="#eef0f3", linewidth=0)
+            for (_, begin), (end, _) in pairwise(rests):
+                axes.axvspan(begin, end, color="#eef0f3", linewidth=0)
             axes.set_xlabel("time from the start of navigation (s)")
         left.legend(loc="best", fontsize=7)
     return svg.getvalue()
 
 
-def before_after(runs: Sequence[RunResult]) -> bytes:
+def before_after(turns: Sequence[TurnResult]) -> bytes:
     """Draw the horizontal velocity after each rotation, measured and without the size effect.
 
     Parameters
     ----------
-    runs : sequence of RunResult
-        The rotations; numbered from 1.
+    turns : sequence of TurnResult
+        The turns; numbered from 1.
 
     Returns
     -------
     bytes
         SVG.
     """
-    with _drawing(0.7 + 0.32 * len(runs)) as (figure, svg):
+    with _drawing(0.7 + 0.32 * len(turns)) as (figure, svg):
         axes: Axes = figure.subplots()
-        at = np.arange(len(runs))
+        at = np.arange(len(turns))
         for k, (name, values) in enumerate(
             (
-                ("as measured", [run.V_n for run in runs]),
-                ("without the size effect", [run.compensated_n for run in runs]),
+                ("as measured", [turn.V_n for turn in turns]),
+                ("without the size effect", [turn.compensated_n for turn in turns]),
             )
         ):
             speed = [np.hypot(v[0], v[1]) / MM for v in values]
             bars = axes.barh(at + 0.2 * (2 * k - 1), speed, 0.34, color=(_GREY, _COLOURS[0])[k], label=name)
             axes.bar_label(bars, fmt="%.1f", padding=3, fontsize=7)
         axes.set(xlabel="horizontal velocity after the rotation (mm/s)")
-        axes.set_yticks(at, [f"run {k + 1}" for k in at])
+        axes.set_yticks(at, [f"turn {k + 1}" for k in at])
         axes.invert_yaxis()
         axes.grid(visible=False, axis="y")
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7)

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from scipy.special import chdtri
 
-from calib.estimation.result import LeverArmEstimate, ParameterEstimate, RunResult
+from calib.estimation.result import LeverArmEstimate, ParameterEstimate, TurnResult
 from calib.estimation.runs import Priors, Run
 from calib.identification import CaptureSummary, IdentificationResult, scatter
 from calib.lever_arms.gauge import LeverArms
@@ -131,7 +131,7 @@ def verdict(identification: IdentificationResult) -> Iterator[tuple[str, str]]:
     yield (
         "good",
         f"{'All nine components' if nine else 'The six differences'} of the sensing points are determined by "
-        f"{counted(len(result.runs), 'rotation')}, method {result.method}; the largest standard uncertainty "
+        f"{counted(len(result.turns), 'rotation')}, method {result.method}; the largest standard uncertainty "
         f"of a difference is {mm(worst, '.3f')} mm.",
     )
     if result.consistent:
@@ -191,7 +191,7 @@ def _agreement(result: LeverArmEstimate) -> tuple[str, str]:
             "note",
             f"The residuals are smaller than expected: {statistic}. The uncertainties are conservative.",
         )
-    if 2 * len(result.runs) <= 6:  # two equations per rotation for six differences: none checks the arms
+    if 2 * len(result.turns) <= 6:  # two equations per rotation for six differences: none checks the arms
         return "good", f"The residuals at rest agree with the noise: {statistic}."
     return "good", f"The velocities agree with the model: {statistic}."
 
@@ -242,46 +242,44 @@ def _rotations(identification: IdentificationResult) -> Iterator[Block]:
         zip(identification.runs, identification.result.runs, strict=True), start=1
     ):
         yield KeyValues(((f"run {number}", sanitise(run.label)), *_rotation(run)))
-        yield _velocity_and_design(result)
+        yield from map(_velocity_and_design, result.turns)
         yield Figure(
-            f"Run {number}. Grey: the rotation. A constant offset comes from the pulse quantisation of the "
+            f"Run {number}. Grey: the turns. A constant offset comes from the pulse quantisation of the "
             "first velocity",
             partial(figures.velocities, run, result),
         )
 
 
 def _rotation(run: Run) -> Iterator[tuple[str, str]]:
-    """Return what was detected of a rotation and its rests."""
-    rotation, aligned = run.rotation, run.aligned
-    yield (
-        "rotation",
-        f"{rotation.angle_deg:+.2f} deg about {rotation.axis} up, {rotation.duration_s:.2f} s, "
-        f"peak {rotation.peak_deg_per_s:.1f} deg/s, axis {rotation.axis_tilt_deg:.2f} deg off the vertical",
-    )
-    before, after = rotation.before, rotation.after
-    yield (
-        "rests",
-        f"{before.duration_s:.1f} s before, {after.duration_s:.1f} s after; "
-        f"{counted(rotation.missing, 'sample')} missing in the rotation, "
-        f"{before.missing + after.missing} in the rests",
-    )
+    """Return what was detected of the turns of a run and its rests."""
+    aligned, before = run.aligned, run.turns[0].before
+    yield "rest before", f"{before.duration_s:.1f} s; {counted(before.missing, 'missing sample')}"
+    for turn, label in zip(run.turns, run.turn_labels, strict=True):
+        yield (
+            f"turn {sanitise(label)}",
+            f"{turn.angle_deg:+.2f} deg about {turn.axis} up, {turn.duration_s:.2f} s, "
+            f"peak {turn.peak_deg_per_s:.1f} deg/s, axis {turn.axis_tilt_deg:.2f} deg off the vertical; "
+            f"then {turn.after.duration_s:.1f} s of rest; "
+            f"{counted(turn.missing + turn.after.missing, 'missing sample')}",
+        )
+        if not turn.accepted:
+            yield "outside the limits", "; ".join(map(english, turn.reasons))
     yield (
         "alignment",
         f"{aligned.duration_s:.1f} s: heading {aligned.heading_rad / DEG:.3f} deg, u "
         f"{aligned.heading_sigma_rad / DEG:.3f} deg; level u {aligned.level_sigma_rad / ARCSEC:.1f} arcsec; "
         f"{sanitise(aligned.motion) if aligned.motion else 'no motion'}",
     )
-    yield "verdict", "accepted: within all limits"
 
 
-def _velocity_and_design(result: RunResult) -> Table:
+def _velocity_and_design(turn: TurnResult) -> Table:
     return Table(
-        "V, mm/s, and H, m/s per m of each component, after the rotation",
+        f"V, mm/s, and H, m/s per m of each component, of turn {sanitise(turn.label)}",
         ("", "east", "north", "up"),
         (
-            ("V", *(mm(v, "+.2f") for v in result.V_n)),
+            ("V", *(mm(v, "+.2f") for v in turn.V_n)),
             *(
-                (f"H, r_{i} {axis}", *(f"{h + 0.0:+.4f}" for h in result.H[:, 3 * i_at + axis_at]))
+                (f"H, r_{i} {axis}", *(f"{h + 0.0:+.4f}" for h in turn.H[:, 3 * i_at + axis_at]))
                 for i_at, i in enumerate("xyz")
                 for axis_at, axis in enumerate("XYZ")
             ),
@@ -308,17 +306,19 @@ def _rejected(sources: Sequence[CaptureSummary]) -> Iterator[Block]:
 
 def _velocities(result: LeverArmEstimate) -> Iterator[Block]:
     yield Table(
-        "Horizontal velocity after the rotation, mm/s",
-        ("run", "measured", "residual", "ratio", "scatter"),
+        "Horizontal velocity gained in each turn, mm/s",
+        ("turn", "measured", "residual", "ratio", "scatter"),
         tuple(
             (
-                f"{k + 1}  {sanitise(run.label)}",
-                mm(_speed(run.V_n)),
-                mm(_speed(run.compensated_n)),
-                f"{_speed(run.compensated_n) / _speed(run.V_n):.1%}",
+                f"{number}  {sanitise(turn.label)}",
+                mm(_speed(turn.V_n)),
+                mm(_speed(turn.compensated_n)),
+                f"{_speed(turn.compensated_n) / _speed(turn.V_n):.1%}",
                 mm(scatter(run), ".3f"),
             )
-            for k, run in enumerate(result.runs)
+            for number, (run, turn) in enumerate(
+                ((run, turn) for run in result.runs for turn in run.turns), start=1
+            )
         ),
     )
     yield Paragraph(
@@ -326,7 +326,7 @@ def _velocities(result: LeverArmEstimate) -> Iterator[Block]:
         "'Scatter' is the rms of the residuals at rest about their mean."
     )
     yield Figure(
-        "Horizontal velocity before and after compensation", lambda: figures.before_after(result.runs)
+        "Horizontal velocity before and after compensation", lambda: figures.before_after(result.turns)
     )
 
 

@@ -3,7 +3,6 @@
 import argparse
 import sys
 from pathlib import Path
-from signal import SIGHUP
 from typing import Final
 
 from imudrv.cli.arguments import add_profile
@@ -13,6 +12,7 @@ from imudrv.service.loop import Service
 from imudrv.service.printer import Printer
 from imudrv.service.runtime import SignalFlags
 from imudrv.service.settings import Settings
+from imudrv.signals import SIGHUP
 from imudrv.terminal import INTERRUPTED, OK
 
 EXAMPLE: Final = (

@@ -28,10 +28,12 @@ _EXPECTED: Final = {
     "less_than": "less than {lt}",
     "less_than_equal": "at most {le}",
     "literal_error": "{expected}",
+    "enum": "{expected}",
     "tuple_type": "a list",
     "list_type": "a list",
     "dict_type": "a mapping (key: value)",
     "model_type": "a mapping (key: value)",
+    "dataclass_type": "a mapping (key: value)",
     "datetime_type": _TIME,
     "datetime_parsing": _TIME,
     "datetime_from_date_parsing": _TIME,
@@ -44,8 +46,11 @@ _Place: TypeAlias = tuple[str | int, ...]
 
 
 def header_faults(document: object, model: type[Model]) -> Iterator[str]:
-    """Yield the faults of `format` and `version`, compared by type too: pydantic takes true and 1.0 for 1."""
-    for name in ("format", "version"):
+    """Yield the faults of `format`, `version` and `kind`.
+
+    They are compared by type too: pydantic takes true and 1.0 for 1.
+    """
+    for name in ("format", "version", "kind"):
         field = model.model_fields.get(name)
         if field is None or get_origin(field.annotation) is not Literal:
             continue
@@ -53,7 +58,9 @@ def header_faults(document: object, model: type[Model]) -> Iterator[str]:
             continue
         allowed, came = get_args(field.annotation), document[name]
         if not any(type(came) is type(value) and came == value for value in allowed):
-            yield f"{name}: expected {' or '.join(map(str, allowed))}, got {shown_value(came)}"
+            advice = model.advice_for_value(name, came)
+            rest = shown_value(came) + (f"; {advice}" if advice else "")
+            yield f"{name}: expected {' or '.join(map(str, allowed))}, got {rest}"
 
 
 def validation_faults(error: ValidationError, document: object, model: type[Model]) -> list[str]:
@@ -67,6 +74,8 @@ def validation_faults(error: ValidationError, document: object, model: type[Mode
             advice = model.advice_for_key(keys) or _nearest(str(place[-1]), known)
             advice = advice or f"known are {', '.join(sorted(known))}"
             found[where, f"unknown key; {advice}"] = []
+        elif name == "unexpected_keyword_argument":  # of a dataclass
+            found[where, "unknown key; remove it"] = []
         elif name == "missing" and isinstance(place[-1], int):
             # One error for each absent item of a tuple, in order: the last one gives the length.
             found[_path(place[:-1]), str(len(came))] = [f"{place[-1] + 1} {_plural(came)}"]
@@ -79,6 +88,8 @@ def validation_faults(error: ValidationError, document: object, model: type[Mode
             found[where, str(len(came))] = [f"{limit.format(**values)} {_plural(came)}"]
         elif name == "value_error":
             found |= {(where, fault): [] for fault in str(values["error"]).splitlines()}
+        elif name == "json_invalid":  # half a character; the rest cannot be wrong here
+            found["", "expected Unicode text, got bytes that are none; is the locale UTF-8?"] = []
         elif name in _EXPECTED:
             advice = model.advice_for_value(keys, came) or _advice(name, came, values)
             rest = shown_value(came) + (f"; {advice}" if advice else "")
@@ -149,7 +160,7 @@ def _advice(expected: str, came: object, values: Mapping[str, Any]) -> str:
         return "put it in quotes"
     if expected in ("int_type", "float_type") and isinstance(came, str) and re.fullmatch(_NUMBER, came):
         return "leave out the quotes"
-    if expected == "literal_error" and isinstance(came, str):
+    if expected in ("literal_error", "enum") and isinstance(came, str):
         return _nearest(came, re.findall(r"'([^']*)'", values["expected"]))
     return ""
 

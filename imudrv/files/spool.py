@@ -11,6 +11,7 @@ from typing import Final, NamedTuple
 
 from imudrv.errors import InputError
 from imudrv.files.outputs import file_to_write
+from imudrv.posix import O_BINARY
 
 PERIOD_S: Final = 0.05
 """Period of writing, s."""
@@ -85,7 +86,7 @@ class AppendThread:
     ) -> None:
         self._target = target = file_to_write(path)
         try:
-            self._file = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+            self._file = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL | O_BINARY, 0o666)
         except FileExistsError as error:
             raise InputError(
                 f"{path}: expected a new file, there is one of that name; move it away or take another name"

@@ -34,7 +34,7 @@ from imudrv.imu.envelope import (
     room_for_points,
 )
 from imudrv.kernels import kernel
-from imudrv.records import Flag, Records, Timebase
+from imudrv.records import PULSES, Flag, Records, Timebase
 from imudrv.units import NS, NS_PER_S, PPM
 
 WINDOW_NS: Final = 90 * NS_PER_S
@@ -200,7 +200,7 @@ class ClockModel:
             One for each sample.
         """
         self.reserve(len(pulses))
-        feed_clock(pulses, *self.arrays)
+        feed_clock(pulses.view(PULSES), *self.arrays)
         stop = int(self._state[0]["fed"])
         stamps: Records = self._stamps[stop - len(pulses) : stop].copy()
         return stamps

@@ -24,7 +24,7 @@ from imudrv.imu.rate_filter import RateFilter, RateFilterName
 from imudrv.imu.rate_filter import rate_filter as make_filter
 from imudrv.imu.size_effect import SIZE_EFFECT, SizeEffect, dv_r, size_effect_constants, unpack_size_effect
 from imudrv.kernels import kernel
-from imudrv.records import INCREMENTS, Flag, Records
+from imudrv.records import INCREMENTS, PULSES, Flag, Records
 from imudrv.units import NS
 from imudrv.vectors import Matrix, Vector, add, matrix, put, rotate, row, scale, subtract, times, vector_at
 from imudrv.wire.layout import Layout
@@ -34,6 +34,8 @@ MAX_TAPS: Final = 32
 
 CONSTANTS: Final = np.dtype(
     [
+        ("gyro_in_pulses", np.bool_),  # otherwise the bits of a float64
+        ("accelerometer_in_pulses", np.bool_),
         ("gyro_scale", np.float64, 3),  # rad per pulse
         ("gyro_bias", np.float64, 3),  # rad/s, body axes
         ("C_bg", np.float64, (3, 3)),
@@ -115,6 +117,7 @@ class Compensator:
         if gyro or len(accelerometer) == 3:
             coefficients = replace(coefficients, r_b=None)  # the size effect needs all angular rates
         self.has_size_effect = coefficients.r_b is not None
+        self._samples_type = layout.samples_type
         self._constants = _constants(coefficients, layout, make_filter(rate_filter, layout.interval_ns))
         self._state = np.zeros(1, STATE)
         self._waiting = np.zeros(MAX_TAPS, INCREMENTS)
@@ -144,6 +147,7 @@ class Compensator:
             body axis that an axis missing in the unit is a part of.
         """
         out = np.empty(int(self._state[0]["waiting"]) + len(pulses), INCREMENTS)
+        pulses = pulses.astype(self._samples_type, copy=False).view(PULSES)
         return out[: compensate(pulses, *self.arrays, out)]
 
     def close(self) -> Records:
@@ -192,6 +196,8 @@ def _constants(c: Coefficients, layout: Layout, rate_filter: RateFilter) -> Reco
     """Fill in the one row of `CONSTANTS`."""
     constants = np.zeros(1, CONSTANTS)
     k = constants[0]
+    k["gyro_in_pulses"] = layout.gyro.is_counted
+    k["accelerometer_in_pulses"] = layout.accelerometer.is_counted
     k["gyro_scale"], k["gyro_bias"], k["C_bg"] = c.gyro_scale, c.gyro_bias, c.C_bg
     k["accelerometer_scale"], k["accelerometer_bias"] = c.accelerometer_scale, c.accelerometer_bias
     k["C_ba"] = c.C_ba
@@ -254,7 +260,7 @@ def compensate(
 
     Parameters
     ----------
-    pulses : ndarray of `imudrv.records.samples_type`
+    pulses : ndarray of PULSES
         In order.
     constants, state, waiting
         `Compensator.arrays`.
@@ -326,7 +332,8 @@ def _scale(pulses: Records, out: Records, c: np.void) -> None:
         if _differ(sample["temperature_degc"], degc, channels):
             degc = sample["temperature_degc"]
             at = _at_temperature(degc, c)
-        gyro, accelerometer = vector_at(sample["gyro"], 0), vector_at(sample["accelerometer"], 0)
+        gyro = _numbers(sample["gyro"], c["gyro_in_pulses"])
+        accelerometer = _numbers(sample["accelerometer"], c["accelerometer_in_pulses"])
         if c["lacks_axes"]:
             gyro = _present(gyro, c["lacks_gyro"])
             accelerometer = _present(accelerometer, c["lacks_accelerometer"])
@@ -338,6 +345,18 @@ def _scale(pulses: Records, out: Records, c: np.void) -> None:
             increment["counter"] //= c["counter_step"]
         increment["interval_ns"] = sample["interval_ns"]
         increment["flags"] = sample["flags"] if at.in_range else sample["flags"] | _TEMPERATURE_RANGE
+
+
+@kernel
+def _numbers(a: NDArray[np.int64], in_pulses: bool) -> Vector:
+    """Return the increments of a sensor: pulses, or other numbers from their bits."""
+    if in_pulses:
+        return float(a[0]), float(a[1]), float(a[2])
+    return (
+        float(np.int64(a[0]).view(np.float64)),
+        float(np.int64(a[1]).view(np.float64)),
+        float(np.int64(a[2]).view(np.float64)),
+    )
 
 
 @kernel

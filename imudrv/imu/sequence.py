@@ -26,7 +26,7 @@ import numpy as np
 from imudrv.imu.arrivals import ARRIVALS, missing_periods
 from imudrv.imu.conversion import TOTALS, constants, convert_increments, convert_status, convert_totals
 from imudrv.kernels import kernel
-from imudrv.records import FRAME, Flag, Records, samples_type
+from imudrv.records import FRAME, PULSES, Flag, Records
 from imudrv.wire.fields import ahead_of
 from imudrv.wire.layout import Layout, SequenceKind
 
@@ -133,10 +133,7 @@ class SequenceTracker:
     """
 
     def __init__(self, layout: Layout) -> None:
-        gyro, accelerometer = layout.sensors
-        self.samples_type = samples_type(
-            gyro_pulses=gyro.is_counted, accelerometer_pulses=accelerometer.is_counted
-        )
+        self.samples_type = layout.samples_type
         self._constants = constants(layout)
         self._state = np.zeros(1, STATE)
         self._counts = np.zeros(1, COUNTS)
@@ -170,8 +167,8 @@ class SequenceTracker:
         """
         if self._state[0]["waits"]:
             frames = np.concatenate([self._state["waiting"], frames])
-        pulses = np.zeros(len(frames), self.samples_type)
-        return pulses[: track(frames, *self.arrays, pulses)]
+        pulses = np.empty(len(frames), self.samples_type)
+        return pulses[: track(frames, *self.arrays, pulses.view(PULSES))]
 
 
 @kernel
@@ -184,7 +181,7 @@ def track(frames: Records, constants: Records, state: Records, counts: Records, 
         If one `waits` by the state, that and at least one more.
     constants, state, counts
         `SequenceTracker.arrays`.
-    samples : ndarray of `imudrv.records.samples_type`
+    samples : ndarray of PULSES
         Receives the samples, one for each good frame.
 
     Returns

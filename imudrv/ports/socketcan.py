@@ -18,7 +18,7 @@ from imudrv.ports.can_port import CanPort
 from imudrv.records import EXTENDED, MESSAGE, Arrival, Records
 from imudrv.system import CLOCK_BOOTTIME, EAGAIN, EINTR, clock_ns, recv
 
-AT_ONCE: Final = 1024
+MESSAGES_AT_ONCE: Final = 1024
 """Most messages of one read."""
 BUS_OFF: Final = -2
 """Error of `receive` that is not one of the system: the controller has left the bus."""
@@ -47,7 +47,7 @@ class SocketcanPort(CanPort):
     def __init__(self, url: str, bus: can.BusABC) -> None:
         super().__init__(url, bus)
         self._fd = bus.fileno()
-        self._messages = np.zeros(AT_ONCE, MESSAGE)
+        self._messages = np.zeros(MESSAGES_AT_ONCE, MESSAGE)
         self._frame: NDArray[np.uint8] = np.zeros(FRAME_BYTES, np.uint8)
         self._timespec: NDArray[np.int64] = np.zeros(2, np.int64)
         self._error = 0  # came after the messages of the read before

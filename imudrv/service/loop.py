@@ -18,7 +18,7 @@ from functools import cache
 from importlib.metadata import version
 from itertools import islice
 from pathlib import Path
-from signal import SIGHUP, SIGINT, SIGTERM
+from signal import SIGINT, SIGTERM
 from typing import Final
 
 import numpy as np
@@ -49,6 +49,7 @@ from imudrv.service.status import (
 )
 from imudrv.service.status_socket import StatusServer, default_status_path
 from imudrv.service.warm_up import warm_up
+from imudrv.signals import SIGHUP
 from imudrv.sinks import open_sink
 from imudrv.sinks.base import Batch, Sink
 from imudrv.sinks.history import History

@@ -39,8 +39,8 @@ from imudrv.chain import Chain, Output, Stages, feed_bytes, feed_messages
 from imudrv.hostclock import OFFSET_NS
 from imudrv.imu.compensation import MAX_TAPS
 from imudrv.kernels import kernel
-from imudrv.ports import socketcan
 from imudrv.ports.base import OTHER_END_GONE
+from imudrv.ports.socketcan import FRAME_BYTES, MESSAGES_AT_ONCE, receive
 from imudrv.records import MESSAGE, Arrival, Records, Timebase
 from imudrv.service.clock_watch import STEP_NS, ClockWatch
 from imudrv.service.latency import Latency, count_latency
@@ -186,7 +186,7 @@ class DescriptorLoop:
 
     def __init__(self, chain: Chain, latency: Latency, in_real_time: bool = True) -> None:
         is_can = isinstance(chain.decoder.decoder, CanAssembler)
-        most = socketcan.AT_ONCE if is_can else AT_ONCE
+        most = MESSAGES_AT_ONCE if is_can else AT_ONCE
         chain.reserve(most, _LARGEST_READS)
         self.pipe = WakePipe()
         self._chain, self._latency = chain, latency
@@ -197,7 +197,7 @@ class DescriptorLoop:
         self._descriptors = np.zeros(2, POLL)
         self._descriptors["events"] = POLLIN
         self._descriptors["fd"][1] = self.pipe.descriptor
-        self._room: Room = (np.zeros(2, np.int64), np.zeros(socketcan.FRAME_BYTES, np.uint8))
+        self._room: Room = (np.zeros(2, np.int64), np.zeros(FRAME_BYTES, np.uint8))
 
     def run(
         self, fd: int, until_ns: int, clocks: ClockWatch, outlets: Sequence[Outlet], is_impatient: bool
@@ -386,8 +386,8 @@ def _read_line(
 def _read_bus(fd: int, s: np.void, room: Room, data: Records, bus: CanBus, stages: Stages) -> int:
     """Read messages and process them; return the time after the last one."""
     timespec, frame = room
-    messages = data[s["size"] : s["size"] + socketcan.AT_ONCE]
-    count, s["error"] = socketcan.receive(fd, frame, timespec, s["offset_ns"], messages)
+    messages = data[s["size"] : s["size"] + MESSAGES_AT_ONCE]
+    count, s["error"] = receive(fd, frame, timespec, s["offset_ns"], messages)
     t_ns = clock_ns(CLOCK_BOOTTIME, timespec) + s["offset_ns"]
     if count:
         feed_messages(messages[:count], *bus, stages)

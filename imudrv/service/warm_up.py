@@ -1,7 +1,6 @@
 """Compile and load every stage before the unit is connected."""
 
 from contextlib import closing
-from typing import Final
 
 import numpy as np
 
@@ -9,19 +8,14 @@ from imudrv.calibration import Calibration, coefficients
 from imudrv.chain import Chain
 from imudrv.imu.rate_filter import RateFilterName
 from imudrv.profiles.schema import Profile
-from imudrv.records import PULSES
+from imudrv.records import MESSAGE, Records
 from imudrv.service.clock_watch import ClockWatch
-from imudrv.service.latency import Latency
+from imudrv.service.latency import Latency, count_latency
 from imudrv.service.serve import DescriptorLoop
-from imudrv.wire.encode import CanEncoder, StreamEncoder
-
-_SAMPLES: Final = 300
-
-_PIECES: Final = 50
 
 
 def warm_up(profile: Profile, calibration: Calibration, rate_filter: RateFilterName, is_direct: bool) -> None:
-    """Send made-up samples through every stage, including a replacement of the calibration.
+    """Call all kernels of the service, those of a replacement of the calibration as well, without a sample.
 
     Parameters
     ----------
@@ -30,18 +24,14 @@ def warm_up(profile: Profile, calibration: Calibration, rate_filter: RateFilterN
     is_direct : bool
         Whether the kernel of `imudrv.service.serve` is needed.
     """
-    layout = profile.layout()
-    pulses = np.zeros(_SAMPLES, PULSES)
-    pulses["counter"] = layout.counter_step * np.arange(_SAMPLES)
-    pulses["temperature_degc"] = 35.0
     chain = Chain(profile, coefficients(calibration), rate_filter)
-    wire = CanEncoder(layout).encode(pulses) if layout.can else StreamEncoder(layout).encode(pulses).tobytes()
-    piece = max(1, len(wire) // _PIECES)
-    for at in range(0, len(wire), piece):
-        chain.feed(wire[at : at + piece], at)
+    nothing: bytes | Records = np.zeros(1, MESSAGE) if profile.layout().can else bytes(1)
+    chain.feed(nothing, 0)
     chain.replace_calibration(coefficients(calibration))
-    chain.feed(wire, len(wire))
+    chain.feed(nothing, 0)
     chain.close()
+    latency = Latency(0)
+    count_latency(0, 0, latency.state)
     if is_direct:
-        with closing(DescriptorLoop(chain, Latency(0))) as loop:
+        with closing(DescriptorLoop(chain, latency)) as loop:
             loop.run(-1, 0, ClockWatch(), [], False)

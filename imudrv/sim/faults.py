@@ -73,7 +73,7 @@ class StreamFaults:
     Parameters
     ----------
     faults : Faults
-        Faults of the scenario; `stream`, `silences` and `unplugs` are used.
+        Faults of the scenario; all but `can` and `counter_jumps` are used.
     kinds : sequence of (int, bytes)
         Length and first bytes of the frames of a sample, in their order; the bytes are used for false syncs.
     seed : int
@@ -96,7 +96,7 @@ class StreamFaults:
         self._odds = [(kind, rate) for kind, rate, _ in table]
         self._act: dict[Kind, Callable[[bytes], bytes]] = {kind: act for kind, _, act in table}
         self._act[Kind.SILENCE] = lambda frame: b""
-        self._silences = faults.silences + faults.unplugs
+        self._silences = faults.quiet
         self._lengths = [length for length, _ in kinds]
         self._next_headers = [kinds[(k + 1) % len(kinds)][1] for k in range(len(kinds))]
         # separate generators for kind and details: chunks of any size draw the same
@@ -176,7 +176,7 @@ class MessageFaults:
     Parameters
     ----------
     faults : Faults
-        Faults of the scenario; `can`, `silences` and `unplugs` are used.
+        Faults of the scenario; all but `stream` and `counter_jumps` are used.
     seed : int
         Same seed, same faults.
     """
@@ -184,7 +184,7 @@ class MessageFaults:
     def __init__(self, faults: Faults, seed: int) -> None:
         rates = faults.can
         self._odds = ((Kind.LOST, rates.lost), (Kind.DOUBLED, rates.doubled), (Kind.SWAPPED, rates.swapped))
-        self._silences = faults.silences + faults.unplugs
+        self._silences = faults.quiet
         self._draw = _generator(seed, 5)
         self._held = np.zeros(0, MESSAGE)
 

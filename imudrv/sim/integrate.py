@@ -17,6 +17,8 @@ has the acceleration `p''` and Coriolis'; the arm is rigid, its inertial acceler
 
 Neglected: the change of gravity along the arm and the displacement, 3.1e-6 / s^2 (0.03 ug over 0.1 m).
 
+A motor adds its acceleration at the pivot; neglected is Coriolis' of its velocity, 1e-7 of the amplitude.
+
 **Dither** rotates the case by `d(t)`, small: `R = I + [d x]`. Neglected: d^2/2, 3e-11 for 1.5 arcsec.
 """
 
@@ -56,12 +58,21 @@ class Dithering(NamedTuple):
     phase: Array  # (3,), cycles, at the start of the run
 
 
+class Shaking(NamedTuple):
+    """Sinusoidal acceleration of the pivot, during the whole run."""
+
+    amplitude_n: Vector  # m/s^2
+    rate: float  # rad/s
+    cycles: Array  # (2,), per sample interval, see `imudrv.sim.path.split_cycles`
+
+
 class Body(NamedTuple):
-    """Constants of a run: the site, the geometry of the unit, the dither of its case."""
+    """Constants of a run: the site and its motor, the geometry of the unit, the dither of its case."""
 
     interval_s: float
     gravity: float  # m/s^2
     omega_ie_n: Vector  # rad/s
+    motor: Shaking
     pivot_to_origin_b: Vector  # m
     A: Array  # (3, 3), row i the sensing direction of accelerometer i in b
     r_b: Array  # (3, 3), row i the sensing point of accelerometer i from the origin of b, m
@@ -99,12 +110,14 @@ class Motion:
 
     def __init__(self, scenario: Scenario, body: Body, split_s: float = 0.0) -> None:
         self._body = body
-        quadrature = Quadrature(body.interval_s, split_s, _case_bandwidth(body.case))
+        bandwidth_hz = _case_bandwidth(body.case) + body.motor.rate / (2.0 * pi)
+        quadrature = Quadrature(body.interval_s, split_s, bandwidth_hz)
+        self._is_shaken = bandwidth_hz > 0.0
         C_nb = start_attitude(scenario.start)
         self._segments = []
-        for number, entry in enumerate(scenario.motion):
+        for number, motion in enumerate(scenario.motions):
             rng = np.random.default_rng(np.random.SeedSequence(scenario.seed, spawn_key=(1, number)))
-            part = path_segment(entry.motion, C_nb, quadrature, rng)
+            part = path_segment(motion, C_nb, quadrature, rng)
             self._segments.append(part)
             C_nb = C_nb @ rotation(part.axes_b[0], part.angle_rad)
         self._ends = np.cumsum([s.intervals for s in self._segments])
@@ -133,7 +146,7 @@ class Motion:
             now, begin, end = self._segment_at(at)
             upto = min(end, stop)
             part = Integrals(*(a[at - first : upto - first] for a in out))
-            if now.is_still and not self._body.case.amplitude_rad.any():
+            if now.is_still and not self._is_shaken:
                 _integrate(now, self._body, 0, 0, Integrals(*(a[:1] for a in part)))
                 for a in part:
                     a[1:] = a[:1]
@@ -170,7 +183,7 @@ def _integrate(segment: PathSegment, body: Body, first: int, run: int, out: Inte
         for j in range(segment.nodes.offset_s.size):
             turn = _turn(segment, body, run + i, path, j)
             omega, omega_dot = _rates(segment, body, turn, path, j)
-            f = _into_b(_force_n(body, path, j), segment, turn)
+            f = _into_b(_force_n(segment, body, run + i, path, j), segment, turn)
             weight = segment.nodes.weight_s[j]
             dtheta = add(dtheta, scale(weight, omega))
             f_o = add(f, _omega_times(omega, omega_dot, body.pivot_to_origin_b))
@@ -259,11 +272,15 @@ def _rates(segment: PathSegment, body: Body, turn: _Turn, path: Path, j: int) ->
 
 
 @kernel
-def _force_n(body: Body, path: Path, j: int) -> Vector:
+def _force_n(segment: PathSegment, body: Body, interval: int, path: Path, j: int) -> Vector:
     """Return the specific force at the pivot, in n."""
-    v, a = path.v, path.a
+    v, a, motor = path.v, path.a, body.motor
     coriolis = scale(2.0, cross(body.omega_ie_n, (v[3, j], v[4, j], v[5, j])))
-    return add(add((a[3, j], a[4, j], a[5, j]), coriolis), (0.0, 0.0, body.gravity))
+    force = add(add((a[3, j], a[4, j], a[5, j]), coriolis), (0.0, 0.0, body.gravity))
+    if motor.rate == 0.0:
+        return force
+    phase = 2.0 * pi * cycles_at(motor.cycles, interval) + motor.rate * segment.nodes.offset_s[j]
+    return add(force, scale(sin(phase), motor.amplitude_n))
 
 
 @kernel

@@ -1,8 +1,8 @@
 """Path of the body in one segment of motion, and the nodes to integrate over it.
 
 A path has six coordinates: three elementary angles about axes fixed to the body, and the displacement of the
-pivot in n. A rotation follows the quintic from rest to rest; rock and vibration are sums of sinusoids, faded
-in and out by the same quintic.
+pivot in n. A rotation follows the quintic from rest to rest; its wobble, rock and vibration are sums of
+sinusoids, faded in and out by the same quintic.
 
 **Integrals** are Gauss-Legendre over panels of at most 1 ms, of the order that the highest frequency needs.
 """
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from imudrv.arrays import Array
 from imudrv.kernels import kernel
 from imudrv.nav.attitude import rotation
-from imudrv.sim.scenario import Rest, Rock, Rotate, Start, Vibrate, intervals
+from imudrv.sim.scenario import OneMotion, Rest, Rock, Rotate, Start, Vibrate, intervals
 from imudrv.units import DEG, MM, STANDARD_GRAVITY
 from imudrv.vectors import Vector
 
@@ -49,7 +49,7 @@ class PathSegment(NamedTuple):
     C_nb: Array  # (3, 3), at the start
     axes_b: Array  # (3, 3), row r the axis of elementary rotation r
     angle_rad: float  # of the rotation from rest to rest, about the first axis
-    ramp: int  # intervals in which the sinusoids are faded in, and out
+    ramp: int  # intervals in which the sinusoids are faded in, and out; not the rotation
     rate: Array  # (m,), of the sinusoids, rad/s
     cycles: Array  # (m, 2), per sample interval, see `split_cycles`
     cosine: Array  # (6, m), amplitudes, rad or m
@@ -195,7 +195,7 @@ def still(count: int, C_nb: Array, quadrature: Quadrature) -> PathSegment:
 
 
 def path_segment(
-    motion: Rest | Rotate | Rock | Vibrate, C_nb: Array, quadrature: Quadrature, rng: np.random.Generator
+    motion: OneMotion, C_nb: Array, quadrature: Quadrature, rng: np.random.Generator
 ) -> PathSegment:
     """Return the segment of one motion of a scenario.
 
@@ -242,8 +242,36 @@ def _rotating(motion: Rotate, at_rest: PathSegment, quadrature: Quadrature) -> P
     axis_b = at_rest.C_nb.T @ (axis_n / np.linalg.norm(axis_n))
     # The peak rate of the quintic is 15/8 of the mean; four times that for products of cosines of the angle.
     bandwidth_hz = 4.0 * 1.875 * abs(angle) / (at_rest.intervals * quadrature.interval_s) / (2.0 * pi)
+    if motion.wobble_deg:
+        return _wobbling(motion, axis_b, at_rest._replace(angle_rad=angle), quadrature, bandwidth_hz)
     return at_rest._replace(
         axes_b=np.array([axis_b, axis_b, axis_b]), angle_rad=angle, nodes=quadrature.nodes(bandwidth_hz)
+    )
+
+
+def _wobbling(
+    motion: Rotate, axis_b: Array, segment: PathSegment, quadrature: Quadrature, bandwidth_hz: float
+) -> PathSegment:
+    """Add a cone to a rotation: about two axes across its own, a quarter of a cycle apart."""
+    across = np.cross(axis_b, np.eye(3)[np.argmin(np.abs(axis_b))])
+    across /= np.linalg.norm(across)
+    amplitude = radians(motion.wobble_deg)
+    cosine, sine = np.zeros((6, 1)), np.zeros((6, 1))
+    cosine[1], sine[2] = amplitude, amplitude
+    rate = 2.0 * pi * np.array([motion.wobble_hz])
+    # Omega doubles the band; the angles modulate the attitude, at worst with the sum of their rates.
+    wobbling_hz = 2.0 * motion.wobble_hz + 2.0 * amplitude * motion.wobble_hz
+    nodes = quadrature.nodes(bandwidth_hz + wobbling_hz)
+    return segment._replace(
+        axes_b=np.array([axis_b, across, np.cross(axis_b, across)]),
+        ramp=max(1, segment.intervals // 4),
+        rate=rate,
+        cycles=split_cycles([motion.wobble_hz], quadrature.interval_s),
+        cosine=cosine,
+        sine=sine,
+        nodes=nodes,
+        offset_cosine=np.cos(np.outer(rate, nodes.offset_s)),
+        offset_sine=np.sin(np.outer(rate, nodes.offset_s)),
     )
 
 
@@ -314,17 +342,17 @@ def evaluate(segment: PathSegment, interval_s: float, k: int, path: Path) -> Non
     path.x[:] = 0.0
     path.v[:] = 0.0
     path.a[:] = 0.0
-    if segment.angle_rad != 0.0:
-        duration = segment.intervals * interval_s
-        for j in range(segment.nodes.offset_s.size):
-            e0, e1, e2 = minimum_jerk((k * interval_s + segment.nodes.offset_s[j]) / duration)
-            path.x[0, j] = segment.angle_rad * e0
-            path.v[0, j] = segment.angle_rad * e1 / duration
-            path.a[0, j] = segment.angle_rad * e2 / duration**2
     for m in range(segment.rate.size):
         _add_sinusoid(segment, m, k, path)
     if segment.rate.size > 0:
         _fade(segment, interval_s, k, path)
+    if segment.angle_rad != 0.0:
+        duration = segment.intervals * interval_s
+        for j in range(segment.nodes.offset_s.size):
+            e0, e1, e2 = minimum_jerk((k * interval_s + segment.nodes.offset_s[j]) / duration)
+            path.x[0, j] += segment.angle_rad * e0
+            path.v[0, j] += segment.angle_rad * e1 / duration
+            path.a[0, j] += segment.angle_rad * e2 / duration**2
 
 
 @kernel

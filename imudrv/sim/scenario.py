@@ -5,14 +5,14 @@ Durations are rounded to whole sample intervals.
 """
 
 from fractions import Fraction
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
-from typing import Annotated, Final, Literal, Self
+from typing import Annotated, Final, Literal, Self, TypeAlias
 
 from pydantic import Field as Key
 from pydantic import model_validator
 
-from imudrv.calibration import Calibration, read_calibration
+from imudrv.calibration import Calibration, SensingPoints, read_calibration
 from imudrv.files import shipped as shipped_files
 from imudrv.files.model import Model
 from imudrv.files.settings_file import parse, read
@@ -31,6 +31,11 @@ Frequency = Annotated[float, Key(gt=0, le=2000)]
 Rate = Annotated[float, Key(ge=0, le=2000)]
 Celsius = Annotated[float, Key(ge=-100, le=200)]
 Limit = Annotated[int, Key(ge=1, le=2**31 - 1)]
+Change = Annotated[float, Key(ge=-1e6, le=1e6)]
+Time = Annotated[float, Key(ge=0, le=1e7)]
+
+MOST_MOTIONS: Final = 1000
+"""Motions of a scenario; each of many turns is two."""
 
 
 class Start(Model):
@@ -59,12 +64,16 @@ class Rotate(Model):
     """Rotation from rest to rest, right-handed about an axis fixed to the bench, with minimum jerk.
 
     The axis is the vertical, tilted by `axis_tilt_mrad` to the east and to the north, or it is `axis_n`.
+    The body wobbles about it by `wobble_deg`, along a cone that it goes round at `wobble_hz` as viewed from
+    the body; the wobble grows in the first quarter of the rotation and fades in the last.
     """
 
     angle_deg: Annotated[float, Key(ge=-36_000, le=36_000)]
     duration_s: Annotated[float, Key(ge=0.05, le=1_000_000)]
     axis_tilt_mrad: tuple[Tilt, Tilt] | None = None
     axis_n: tuple[float, float, float] | None = None
+    wobble_deg: Annotated[float, Key(ge=0, le=20)] = 0.0
+    wobble_hz: Annotated[float, Key(gt=0, le=100)] = 1.0
 
     @model_validator(mode="after")
     def _one_axis(self) -> Self:
@@ -75,6 +84,26 @@ class Rotate(Model):
                 f"axis_n: expected a direction, with a component of at least 0.001, got {self.axis_n}"
             )
         return self
+
+
+class Turns(Model):
+    """Rotations that follow each other, each with a rest of `arrest_s` after it.
+
+    `alternate`: every second one is the other way round.
+    """
+
+    count: Annotated[int, Key(ge=1, le=100)]
+    rotate: Rotate
+    arrest_s: Duration
+    alternate: bool = True
+
+    @property
+    def motions(self) -> tuple[Rotate | Rest, ...]:
+        """The rotations and rests."""
+        rest = Rest(duration_s=self.arrest_s)
+        back = self.rotate.model_copy(update={"angle_deg": -self.rotate.angle_deg})
+        ways = self.rotate, back if self.alternate else self.rotate
+        return tuple(motion for k in range(self.count) for motion in (ways[k % 2], rest))
 
 
 class _Random(Model):
@@ -115,33 +144,41 @@ class Vibrate(_Random):
     rate_rms_deg_per_s: tuple[Rate, Rate, Rate] = (0.0, 0.0, 0.0)
 
 
+OneMotion: TypeAlias = Rest | Rotate | Rock | Vibrate
+
+
 class Segment(Model):
     """One entry of the motion, with exactly one key."""
 
     rest: Rest | None = None
     rotate: Rotate | None = None
+    turns: Turns | None = None
     rock: Rock | None = None
     vibrate: Vibrate | None = None
 
     @model_validator(mode="after")
     def _exactly_one(self) -> Self:
-        given = [name for name in ("rest", "rotate", "rock", "vibrate") if getattr(self, name) is not None]
+        names = list(type(self).model_fields)
+        given = [name for name in names if getattr(self, name) is not None]
         if len(given) != 1:
-            raise ValueError(
-                f"expected one of rest, rotate, rock, vibrate, got {' and '.join(given) or 'none'}"
-            )
+            raise ValueError(f"expected one of {', '.join(names)}, got {' and '.join(given) or 'none'}")
         return self
 
     @property
-    def motion(self) -> Rest | Rotate | Rock | Vibrate:
-        """The motion of the one key."""
-        motions: tuple[Rest | Rotate | Rock | Vibrate | None, ...]
-        motions = self.rest, self.rotate, self.rock, self.vibrate
-        return next(motion for motion in motions if motion is not None)
+    def motions(self) -> tuple[OneMotion, ...]:
+        """The motion of the one key; several for many turns."""
+        if self.turns is not None:
+            return self.turns.motions
+        motions: tuple[OneMotion | None, ...] = self.rest, self.rotate, self.rock, self.vibrate
+        return tuple(motion for motion in motions if motion is not None)
 
 
 class Residuals(Model):
-    """1-sigma differences between the unit and its calibration, drawn once for each axis."""
+    """1-sigma differences between the unit and its calibration, drawn once for each axis.
+
+    Those per kelvin are from `temperature.start_degc` on, or from the reference temperature of a calibration
+    that has temperature terms.
+    """
 
     gyro_bias_deg_per_h: Amount = 0.0
     gyro_scale_ppm: Amount = 0.0
@@ -149,6 +186,21 @@ class Residuals(Model):
     accelerometer_bias_ug: Amount = 0.0
     accelerometer_scale_ppm: Amount = 0.0
     accelerometer_misalignment_urad: Amount = 0.0
+    gyro_bias_deg_per_h_per_k: Amount = 0.0
+    gyro_scale_ppm_per_k: Amount = 0.0
+    accelerometer_bias_ug_per_k: Amount = 0.0
+    accelerometer_scale_ppm_per_k: Amount = 0.0
+
+
+class BiasStep(Model):
+    """Change of the biases from the first sample that ends after `at_s`, as from one pose to the next.
+
+    Gyros in body axes, accelerometers on their sensing axes, as in the calibration.
+    """
+
+    at_s: Time
+    gyro_deg_per_h: tuple[Change, Change, Change] = (0.0, 0.0, 0.0)
+    accelerometer_ug: tuple[Change, Change, Change] = (0.0, 0.0, 0.0)
 
 
 class Noise(Model):
@@ -199,13 +251,19 @@ class Saturation(Model):
 class Unit(Model):
     """Unit: its calibration (a file, or inline, by default a nominal one for the profile) and its errors.
 
-    The path of the file is relative to the scenario. Residuals make the unit differ from its calibration.
-    The sample interval of the accelerometers ends `accelerometer_skew_s` later than that of the gyros.
+    The path of the file is relative to the scenario. `r_mm` are the true sensing points, where the
+    calibration is that of a unit whose lever arms are still to be found. Residuals make the unit differ from
+    its calibration; `seed` draws them, by default that of the scenario: scenarios with the same `seed` here
+    and different ones there are of one unit. The sample interval of the accelerometers ends
+    `accelerometer_skew_s` later than that of the gyros.
     """
 
     calibration_file: Annotated[str, Key(min_length=1, max_length=4096)] | None = None
     calibration: Calibration | None = None
+    r_mm: SensingPoints | None = None
+    seed: Annotated[int, Key(ge=0, lt=2**63)] | None = None
     residuals: Residuals = Residuals()
+    bias_steps: Annotated[tuple[BiasStep, ...], Key(max_length=1000)] = ()
     noise: Noise = Noise()
     dither: Dither | None = None
     accelerometer_skew_s: Annotated[float, Key(ge=-0.01, le=0.01)] = 0.0
@@ -220,15 +278,26 @@ class Unit(Model):
         return self
 
 
+class Motor(Model):
+    """Motor on the bench: it shakes the pivot with `mg * sin` east, north and up, during the whole run."""
+
+    frequency_hz: Frequency
+    mg: tuple[Change, Change, Change]
+
+
 class Silence(Model):
     """Time in which nothing is sent."""
 
-    at_s: Annotated[float, Key(ge=0, le=1e7)]
+    at_s: Time
     duration_s: Duration
 
 
 class Unplug(Silence):
     """Unplugged cable: a silence; in real time the port disappears and comes back."""
+
+
+class Restart(Silence):
+    """Unit without power; it warms up again, and its counter begins again at 0."""
 
 
 class CounterJump(Model):
@@ -237,7 +306,7 @@ class CounterJump(Model):
     A time jumps by as many samples.
     """
 
-    at_s: Annotated[float, Key(ge=0, le=1e7)]
+    at_s: Time
     by: Annotated[int, Key(ge=-(2**32), le=2**32)]
 
 
@@ -280,17 +349,28 @@ class Faults(Model):
     can: MessageRates = MessageRates()
     silences: Annotated[tuple[Silence, ...], Key(max_length=1000)] = ()
     unplugs: Annotated[tuple[Unplug, ...], Key(max_length=1000)] = ()
+    restarts: Annotated[tuple[Restart, ...], Key(max_length=1000)] = ()
     counter_jumps: Annotated[tuple[CounterJump, ...], Key(max_length=1000)] = ()
 
     @model_validator(mode="after")
-    def _one_cable(self) -> Self:
-        for before, after in pairwise(self.unplugs):
-            if before.at_s + before.duration_s >= after.at_s:
-                raise ValueError(
-                    f"unplugs: expected one after the other, got one at {after.at_s:g} s "
-                    f"before the end of that at {before.at_s:g} s"
-                )
+    def _in_order(self) -> Self:
+        _require_in_order("unplugs", self.unplugs)
+        _require_in_order("restarts", self.restarts)
         return self
+
+    @property
+    def quiet(self) -> tuple[Silence, ...]:
+        """Every time in which nothing is sent."""
+        return self.silences + self.unplugs + self.restarts
+
+
+def _require_in_order(name: str, silences: tuple[Silence, ...]) -> None:
+    for before, after in pairwise(silences):
+        if before.at_s + before.duration_s >= after.at_s:
+            raise ValueError(
+                f"{name}: expected one after the other, got one at {after.at_s:g} s "
+                f"before the end of that at {before.at_s:g} s"
+            )
 
 
 class Scenario(Model):
@@ -301,9 +381,24 @@ class Scenario(Model):
     seed: Annotated[int, Key(ge=0, lt=2**63)] = 0
     site: Site
     start: Start = Start()
-    motion: Annotated[tuple[Segment, ...], Key(min_length=1, max_length=1000)]
+    motion: Annotated[tuple[Segment, ...], Key(min_length=1, max_length=MOST_MOTIONS)]
+    motor: Motor | None = None
     unit: Unit = Unit()
     faults: Faults = Faults()
+
+    @model_validator(mode="after")
+    def _not_too_many(self) -> Self:
+        if len(self.motions) > MOST_MOTIONS:
+            raise ValueError(
+                f"motion: expected at most {MOST_MOTIONS} rotations and rests, got {len(self.motions)} with "
+                "those of turns"
+            )
+        return self
+
+    @property
+    def motions(self) -> tuple[OneMotion, ...]:
+        """Motions in order."""
+        return tuple(chain.from_iterable(segment.motions for segment in self.motion))
 
 
 NOMINAL = parse(
@@ -410,7 +505,7 @@ def samples(scenario: Scenario, interval: Fraction) -> int:
     -------
     int
     """
-    return sum(intervals(segment.motion.duration_s, interval * NS) for segment in scenario.motion)
+    return sum(intervals(motion.duration_s, interval * NS) for motion in scenario.motions)
 
 
 def intervals(duration_s: float, interval_s: float) -> int:

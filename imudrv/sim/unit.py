@@ -10,6 +10,7 @@ with `k_g`, `K`, `b_g`, `b` each at the temperature of the sample: the scale in 
 `1 + ppm_per_k (T - T_reference)`, the bias plus `bias_per_k (T - T_reference)`. `N` are pulses, or rad and
 m/s of a unit that sends other units. Pulses and counts of increments and totals are integers; the fraction is
 carried into the next sample. The encoder makes counts of rates and of floating-point numbers.
+Bias steps change `b_g` and `b` during the run.
 """
 
 from collections.abc import Iterator
@@ -27,12 +28,12 @@ from imudrv.imu.compensation import require_sensors
 from imudrv.imu.conversion import constants
 from imudrv.kernels import kernel
 from imudrv.nav.earth import earth_rate_n
-from imudrv.records import Records, samples_type
-from imudrv.sim.integrate import Body, Dithering, Integrals, Motion
+from imudrv.records import Records
+from imudrv.sim.integrate import Body, Dithering, Integrals, Motion, Shaking
 from imudrv.sim.path import cycles_at, split_cycles
-from imudrv.sim.scenario import Dither, Faults, Saturation, Scenario, nominal
-from imudrv.units import ARCSEC, DEG_PER_H, DEG_PER_SQRT_H, MM, NS, PPM, UG, URAD
-from imudrv.vectors import Vector, dot, row
+from imudrv.sim.scenario import BiasStep, Dither, Faults, Motor, Residuals, Saturation, Scenario, nominal
+from imudrv.units import ARCSEC, DEG_PER_H, DEG_PER_SQRT_H, MM, NS, PPM, STANDARD_GRAVITY, UG, URAD
+from imudrv.vectors import Vector, add, dot, row
 from imudrv.wire.layout import Layout, SequenceKind, Values
 
 PER_SQRT_H: Final = 1.0 / 60.0
@@ -94,6 +95,8 @@ class _Electronics(NamedTuple):
     accelerometer_scale_per_k: Array
     accelerometer_noise: float  # m/s
     counts: _Counts
+    step_at_s: Array  # (m,), when biases change
+    steps: Array  # (m, 6), of gyros, rad/s, and accelerometers, m/s^2
     reference_degc: float
     start_degc: float
     slope_k_per_s: float
@@ -107,7 +110,8 @@ def draw_true_unit(scenario: Scenario, layout: Layout) -> Coefficients:
     Parameters
     ----------
     scenario : Scenario
-        `unit` and `seed` are used; the seed gives the normalised residuals, scaled by their 1-sigma.
+        `unit` is used, and its seed, or else `seed`: it gives the normalised residuals, scaled by their
+        1-sigma.
     layout : Layout
         Layout of the profile.
 
@@ -122,8 +126,9 @@ def draw_true_unit(scenario: Scenario, layout: Layout) -> Coefficients:
     """
     certified = coefficients(_certificate(scenario, layout))
     require_sensors(certified, layout)
-    residuals = scenario.unit.residuals
-    gyro_normal, accelerometer_normal = _generator(scenario, 2).standard_normal((2, 12))
+    unit = scenario.unit
+    residuals, seed = unit.residuals, scenario.seed if unit.seed is None else unit.seed
+    gyro_normal, accelerometer_normal = _generator(seed, 2).standard_normal((2, 12))
     return replace(
         certified,
         gyro_scale=certified.gyro_scale * (1.0 + residuals.gyro_scale_ppm * PPM * gyro_normal[0:3]),
@@ -135,6 +140,8 @@ def draw_true_unit(scenario: Scenario, layout: Layout) -> Coefficients:
         + residuals.accelerometer_bias_ug * UG * accelerometer_normal[3:6],
         C_ba=_misaligned(residuals.accelerometer_misalignment_urad, accelerometer_normal[6:])
         @ certified.C_ba,
+        r_b=certified.r_b if unit.r_mm is None else unit.r_mm.r_m,
+        temperature=_drifting(certified.temperature, residuals, unit.temperature.start_degc, seed),
     )
 
 
@@ -170,13 +177,11 @@ def simulate(scenario: Scenario, layout: Layout, chunk: int = 65_536) -> Iterato
         raise InputError(f"simulation: expected chunks of at least one sample, got {chunk}")
     interval_s = interval * NS
     truth = draw_true_unit(scenario, layout)
-    rng = _generator(scenario, 3)
+    rng = _generator(scenario.seed, 3)
     # With a skew, an accelerometer sample is the late part of one interval and the early part of a later one.
     skew, split_ns = divmod(round(scenario.unit.accelerometer_skew_s / NS), interval)
     motion = Motion(scenario, _body(scenario, truth, interval_s), split_ns * NS)
     electronics = _electronics(scenario, truth, layout)
-    gyro, accelerometer = layout.sensors
-    kind = samples_type(gyro_pulses=gyro.is_counted, accelerometer_pulses=accelerometer.is_counted)
     start = scenario.start.counter if layout.sequence.kind is SequenceKind.COUNTER else 0
     carry = np.zeros(6)
     for first in range(0, motion.samples, chunk):
@@ -186,10 +191,13 @@ def simulate(scenario: Scenario, layout: Layout, chunk: int = 65_536) -> Iterato
         own = Integrals(*(a[-begin : n - begin] for a in around))
         later = skew - begin
         velocity = around.late[later : later + n] + around.early[later + 1 : later + 1 + n]
-        pulses = np.zeros(n, kind)
+        pulses = np.zeros(n, layout.samples_type)
         ends_ns = np.arange(first, first + n + 1) * interval.numerator // interval.denominator
         t_ns = ends_ns[1:]
-        counter = start + step * np.arange(first, first + n)
+        powered_ns = _powered(scenario.faults, t_ns)
+        since = -(-(powered_ns + 1) * interval.denominator // interval.numerator) - 1  # first sample after
+        begun = np.where(powered_ns < 0, start, -step * since - jumped(scenario.faults, powered_ns))
+        counter = begun + step * np.arange(first, first + n)
         pulses["counter"] = counter + jumped(scenario.faults, t_ns)
         pulses["arrival_ns"] = pulses["elapsed_ns"] = t_ns
         pulses["interval_ns"] = np.diff(ends_ns)
@@ -200,7 +208,7 @@ def simulate(scenario: Scenario, layout: Layout, chunk: int = 65_536) -> Iterato
         _count(electronics, first, own.dtheta_b, velocity, noise, carry, increments, degc, overflow)
         pulses["gyro"], pulses["accelerometer"] = increments[:, :3], increments[:, 3:]
         pulses["temperature_degc"] = degc[:, None]
-        warm_up = t_ns * NS <= scenario.unit.warm_up_s
+        warm_up = (t_ns - np.maximum(powered_ns, 0)) * NS <= scenario.unit.warm_up_s
         meaning = layout.status
         pulses["status"] = meaning.inverted ^ (meaning.warm_up * warm_up | meaning.saturated * overflow)
         yield Chunk(pulses, _truth(pulses, own))
@@ -226,12 +234,44 @@ def jumped(faults: Faults, t_ns: np.ndarray) -> np.ndarray:
     return total
 
 
+def _powered(faults: Faults, t_ns: np.ndarray) -> np.ndarray:
+    """Return when the power came last, for each sample; -1 before the first restart."""
+    powered_ns = np.full(t_ns.size, -1, np.int64)
+    for restart in faults.restarts:
+        again_ns = round((restart.at_s + restart.duration_s) / NS)
+        powered_ns[t_ns > again_ns] = again_ns
+    return powered_ns
+
+
 def _certificate(scenario: Scenario, layout: Layout) -> Calibration:
     return scenario.unit.calibration or nominal(layout)
 
 
-def _generator(scenario: Scenario, stream: int) -> np.random.Generator:
-    return np.random.default_rng(np.random.SeedSequence(scenario.seed, spawn_key=(stream,)))
+def _generator(seed: int, stream: int) -> np.random.Generator:
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))
+
+
+def _drifting(
+    terms: TemperatureTerms | None, residuals: Residuals, start_degc: float, seed: int
+) -> TemperatureTerms | None:
+    """Add what the calibration does not know of the change with temperature."""
+    sigmas = (
+        residuals.gyro_bias_deg_per_h_per_k * DEG_PER_H,
+        residuals.gyro_scale_ppm_per_k * PPM,
+        residuals.accelerometer_bias_ug_per_k * UG,
+        residuals.accelerometer_scale_ppm_per_k * PPM,
+    )
+    if not any(sigmas):
+        return terms
+    known = terms or TemperatureTerms(start_degc, -np.inf, np.inf)
+    normal = _generator(seed, 7).standard_normal((4, 3))
+    return replace(
+        known,
+        gyro_bias=known.gyro_bias + sigmas[0] * normal[0],
+        gyro_scale=known.gyro_scale + sigmas[1] * normal[1],
+        accelerometer_bias=known.accelerometer_bias + sigmas[2] * normal[2],
+        accelerometer_scale=known.accelerometer_scale + sigmas[3] * normal[3],
+    )
 
 
 def _misaligned(urad: float, normal: Array) -> Array:
@@ -252,11 +292,20 @@ def _body(scenario: Scenario, truth: Coefficients, interval_s: float) -> Body:
         interval_s=interval_s,
         gravity=site.gravity,
         omega_ie_n=earth_rate_n(site.latitude_rad),
+        motor=_shaking(scenario.motor, interval_s),
         pivot_to_origin_b=(x, y, z),
         A=_inverse(truth.C_ba),
         r_b=np.zeros((3, 3)) if truth.r_b is None else truth.r_b,
         case=_dithering(scenario, truth, interval_s, dither.case_reaction if dither else 0.0),
     )
+
+
+def _shaking(motor: Motor | None, interval_s: float) -> Shaking:
+    if motor is None:
+        return Shaking((0.0, 0.0, 0.0), 0.0, np.zeros(2))
+    east, north, up = (1e-3 * STANDARD_GRAVITY * mg for mg in motor.mg)
+    cycles = split_cycles(motor.frequency_hz, interval_s)
+    return Shaking((east, north, up), 2.0 * pi * motor.frequency_hz, cycles)
 
 
 def _dithering(scenario: Scenario, truth: Coefficients, interval_s: float, fraction: float) -> Dithering:
@@ -268,7 +317,7 @@ def _dithering(scenario: Scenario, truth: Coefficients, interval_s: float, fract
         amplitude_rad=fraction * np.array(dither.amplitude_arcsec) * ARCSEC,
         rate=2.0 * pi * frequency_hz,
         cycles=split_cycles(frequency_hz, interval_s),
-        phase=_generator(scenario, 4).random(3),
+        phase=_generator(scenario.seed, 4).random(3),
     )
 
 
@@ -301,6 +350,7 @@ def _electronics(scenario: Scenario, truth: Coefficients, layout: Layout) -> _El
     settles = temperature.settles_at_degc
     G = _inverse(truth.C_bg)
     terms = truth.temperature or TemperatureTerms(0.0, 0.0, 0.0)
+    step_at_s, steps = _bias_steps(unit.bias_steps)
     return _Electronics(
         interval_s=interval_s,
         G=G,
@@ -316,12 +366,23 @@ def _electronics(scenario: Scenario, truth: Coefficients, layout: Layout) -> _El
         accelerometer_scale_per_k=terms.accelerometer_scale,
         accelerometer_noise=unit.noise.vrw_m_s_per_sqrt_h * PER_SQRT_H * interval_s**0.5,
         counts=_counts(layout, unit.saturation),
+        step_at_s=step_at_s,
+        steps=steps,
         reference_degc=terms.reference_degc,
         start_degc=temperature.start_degc,
         slope_k_per_s=temperature.slope_k_per_h / 3600.0,
         rise_k=0.0 if settles is None else settles - temperature.start_degc,
         time_constant_s=temperature.time_constant_s or 1.0,
     )
+
+
+def _bias_steps(steps: tuple[BiasStep, ...]) -> tuple[Array, Array]:
+    at_s, changes = np.zeros(len(steps)), np.zeros((len(steps), 6))
+    for k, step in enumerate(steps):
+        at_s[k] = step.at_s
+        changes[k, :3] = np.array(step.gyro_deg_per_h) * DEG_PER_H
+        changes[k, 3:] = np.array(step.accelerometer_ug) * UG
+    return at_s, changes
 
 
 def _truth(pulses: Records, own: Integrals) -> Records:
@@ -355,10 +416,11 @@ def _count(
         )
         warmer = degc[i] - unit.reference_degc
         angle_now = _dither_angle(unit.dither, first + i + 1)
+        gyro_step, accelerometer_step = _bias_change(unit, t)
         angle_b = (
-            dtheta_b[i, 0] + tau * (unit.gyro_bias[0] + warmer * unit.gyro_bias_per_k[0]),
-            dtheta_b[i, 1] + tau * (unit.gyro_bias[1] + warmer * unit.gyro_bias_per_k[1]),
-            dtheta_b[i, 2] + tau * (unit.gyro_bias[2] + warmer * unit.gyro_bias_per_k[2]),
+            dtheta_b[i, 0] + tau * (unit.gyro_bias[0] + warmer * unit.gyro_bias_per_k[0] + gyro_step[0]),
+            dtheta_b[i, 1] + tau * (unit.gyro_bias[1] + warmer * unit.gyro_bias_per_k[1] + gyro_step[1]),
+            dtheta_b[i, 2] + tau * (unit.gyro_bias[2] + warmer * unit.gyro_bias_per_k[2] + gyro_step[2]),
         )
         overflow[i] = False
         for m in range(3):
@@ -367,12 +429,26 @@ def _count(
             increments[i, m], is_over = _sent(angle / scale, unit.counts, carry, m)
             overflow[i] |= is_over
         for m in range(3):
-            bias = unit.accelerometer_bias[m] + warmer * unit.accelerometer_bias_per_k[m]
+            bias = (
+                unit.accelerometer_bias[m] + warmer * unit.accelerometer_bias_per_k[m] + accelerometer_step[m]
+            )
             speed = velocity[i, m] + tau * bias + unit.accelerometer_noise * noise[i, 3 + m]
             scale = unit.accelerometer_scale[m] * (1.0 + warmer * unit.accelerometer_scale_per_k[m])
             increments[i, 3 + m], is_over = _sent(speed * scale, unit.counts, carry, 3 + m)
             overflow[i] |= is_over
         before = angle_now
+
+
+@kernel
+def _bias_change(unit: _Electronics, t: float) -> tuple[Vector, Vector]:
+    """Return the sum of the bias steps before the end of a sample, of gyros and accelerometers."""
+    gyro, accelerometer = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    for k in range(unit.step_at_s.size):
+        if t > unit.step_at_s[k]:
+            step = unit.steps[k]
+            gyro = add(gyro, (step[0], step[1], step[2]))
+            accelerometer = add(accelerometer, (step[3], step[4], step[5]))
+    return gyro, accelerometer
 
 
 @kernel

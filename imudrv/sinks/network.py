@@ -8,9 +8,10 @@ import time
 from typing import Any, Final, TypeAlias
 
 from imudrv.errors import InputError
+from imudrv.loopback import LOOPBACK
 from imudrv.sinks.backlog import Backlog
 from imudrv.sinks.base import Batch, Outlet, Sink, SinkState, Written
-from imudrv.url import LOOPBACK, host_and_port, split
+from imudrv.url import host_and_port, split
 from imudrv.wire.datagram import SIZE
 
 MAX_CLIENTS: Final = 32

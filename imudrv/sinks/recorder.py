@@ -33,7 +33,10 @@ from imudrv.wire.layout import Layout
 QUEUE_BYTES: Final = 32 << 20
 """Maximum size of each queue: 15 s of single reads at 20 kHz, minutes at 1 kHz."""
 _OVERHEAD: Final = 64
-_PIECE: Final = 256  # reads, and batches, written at a time
+_PIECE: Final = 256
+"""Most reads, and batches, written at a time."""
+_PIECE_BYTES: Final = 1 << 20
+"""About as many bytes at a time, so that no message is larger than readers take (4 MiB)."""
 
 # A message; packing takes 0.2 us here and 4 us in the library, during which the loop cannot run. So the
 # summary of the library has no statistics of messages.
@@ -245,7 +248,7 @@ class Recorder:
             while True:
                 t_ns, channel, document = self._notes.popleft()
                 self._message(channel, t_ns, json.dumps(document(), default=str).encode())
-        more = max(len(arrivals), len(batches)) == _PIECE
+        more = self._wire.left or self._datagrams.left
         return Piece(self._staging.take(), len(datagrams) // SIZE, more)
 
     def _last_piece(self) -> bytes:
@@ -276,6 +279,7 @@ class _Queue(Generic[T]):
         self._size = size
         self._items: deque[T] = deque()
         self._put = self._taken = 0
+        self.left = False  # items, perhaps, by the bounds of the last `take`
 
     def put(self, *items: T) -> None:
         """Append items (in the loop); drop the oldest above the limit."""
@@ -287,12 +291,15 @@ class _Queue(Generic[T]):
                 self.dropped += 1
 
     def take(self, count: int) -> list[T]:
-        """Remove up to `count` items (in the thread) and return them."""
+        """Remove up to `count` items, and about `_PIECE_BYTES`, (in the thread) and return them."""
         items: list[T] = []
+        size = 0
         with suppress(IndexError):
-            while len(items) < count:
+            while len(items) < count and size < _PIECE_BYTES:
                 items.append(self._items.popleft())
-        self._taken += sum(map(self._size, items)) + _OVERHEAD * len(items)
+                size += self._size(items[-1])
+        self.left = len(items) == count or size >= _PIECE_BYTES
+        self._taken += size + _OVERHEAD * len(items)
         return items
 
 

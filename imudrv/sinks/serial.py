@@ -2,7 +2,6 @@
 
 import errno
 import os
-import termios
 import time
 from contextlib import suppress
 from threading import Thread
@@ -11,6 +10,7 @@ from typing import Final
 import serial
 
 from imudrv.ports.serial import explain
+from imudrv.posix import require_posix, termios
 from imudrv.profiles.schema import SerialLine
 from imudrv.sinks.backlog import Backlog
 from imudrv.sinks.base import Batch, Outlet, Sink, SinkState, Written
@@ -44,6 +44,7 @@ class SerialSink(Sink):
 
     def __init__(self, url: str) -> None:
         super().__init__(url)
+        require_posix(url, "send to udp:// or tcp:// instead")
         parts = split(url)
         self._path, self._settings = device_path(parts), serial_settings(parts, SerialLine(baudrate=BAUDRATE))
         self._backlog = Backlog(_PIECE)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from imudrv.kernels import kernel
 from imudrv.records import FRAME, REJECT, Reason, Records
-from imudrv.wire.fields import SLACK, checks_hold, fill, hold, plain_check_holds
+from imudrv.wire.fields import SLACK, checks_hold, fill, fill_all, hold, plain_check_holds
 from imudrv.wire.layout import MAX_MESSAGES, Layout
 from imudrv.wire.tables import Tables, layout_tables
 
@@ -36,11 +36,8 @@ STATE: Final = np.dtype(
 )
 """State that a call of the kernel leaves to the next."""
 
-StreamArrays: TypeAlias = tuple[NDArray[np.uint8], Tables, Records, Records, bool | None]
-"""Buffer, tables of the layout, state, room for rejects, and whether `_scan_kinds` is needed.
-
-None instead of False: then numba compiles only the other one.
-"""
+StreamArrays: TypeAlias = tuple[NDArray[np.uint8], Tables, Records, Records, bool]
+"""Buffer, tables of the layout, state, room for rejects, and whether `_scan_kinds` is needed."""
 
 _NO_SYNC: Final = int(Reason.NO_SYNC)
 _CHECK_FAILED: Final = int(Reason.CHECK_FAILED)
@@ -84,7 +81,7 @@ class StreamDecoder:
         is_usual = (
             len(layout.messages) == 1 and not only.multiplexed and only.checks in ((), (only.plain_check,))
         )
-        self._has_kinds = None if is_usual else True
+        self._has_kinds = not is_usual
         self._state = np.zeros(1, STATE)
         self._buffer: NDArray[np.uint8] = np.zeros(0, np.uint8)
         self._rejects = np.zeros(0, REJECT)
@@ -218,7 +215,7 @@ def decode(
     tables: Tables,
     state: Records,
     rejects: Records,
-    has_kinds: bool | None,
+    has_kinds: bool,
     frames: Records,
 ) -> tuple[int, int]:
     """Decode the new bytes of the buffer, which follow the pending ones; what remains moves to its beginning.
@@ -244,10 +241,10 @@ def decode(
         return 0, 0
     begin = s["pending"]
     stop = begin + ends[-1]
-    if has_kinds is None:
-        position, found, rejected = _scan(buffer, begin, ends, times, tables, state, frames, rejects)
-    else:
+    if has_kinds:
         position, found, rejected = _scan_kinds(buffer, begin, ends, times, tables, state, frames, rejects)
+    else:
+        position, found, rejected = _scan(buffer, begin, ends, times, tables, state, frames, rejects)
     s["offset"] += position
     s["pending"] = stop - position
     for k in range(stop - position):
@@ -281,7 +278,7 @@ def _scan(
         Position of the first byte that is neither in a frame nor rejected; number of frames and of rejects.
     """
     # Out of the tuple once: each access inside the loop would count references.
-    kinds, fields, multiplexed, constants, _ = tables
+    kinds, fields, _, constants, _ = tables
     kind, s = kinds[0], state[0]
     length, offset = kind["length"], s["offset"]
     p = found = rejected = read = 0
@@ -304,12 +301,13 @@ def _scan(
             p += 1
             continue
         frame = frames[found]
-        fill(data, p, kind, fields, multiplexed, frame)
-        frame["offset"], frame["t_ns"] = offset + p, times[read]
-        frame["damaged"] = (s["skipped"] + length - 1) // length
-        s["skipped"] = 0
+        frame["offset"], frame["t_ns"], frame["damaged"] = offset + p, times[read], 0
+        if s["skipped"]:
+            frame["damaged"] = (s["skipped"] + length - 1) // length
+            s["skipped"] = 0
         found += 1
         p += length
+    fill_all(data, offset, kind, fields, frames[:found])
     return p, found, rejected
 
 

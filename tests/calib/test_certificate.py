@@ -19,7 +19,7 @@ from calib.certificate import (
 )
 from calib.detection.acceptance import RotationLimits
 from calib.detection.noise import Noise
-from calib.estimation.result import CENTROID_BASIS, LeverArmEstimate, ParameterEstimate, RunResult
+from calib.estimation.result import CENTROID_BASIS, LeverArmEstimate, ParameterEstimate, RunResult, TurnResult
 from calib.estimation.runs import Priors
 from calib.identification import IdentificationResult, PriorCalibration
 from calib.lever_arms.gauge import convert
@@ -37,10 +37,8 @@ WHEN = datetime(2026, 11, 25, 12, 0, tzinfo=UTC)
 
 def identification(**changes: object) -> IdentificationResult:
     told = RunResult(
-        label="z#1",
-        V_n=np.array([0.2, -0.1, 0.0]),
-        H=np.zeros((3, 9)),
-        compensated_n=np.zeros(3),
+        label="z",
+        turns=(TurnResult("z", True, np.array([0.2, -0.1, 0.0]), np.zeros((3, 9)), np.zeros(3)),),
         H_rest=1e-4,
         t_s=np.arange(4.0),
         v_n=np.full((4, 2), 1e-3),
@@ -88,7 +86,7 @@ def unit(serial_number: str = "50-0017") -> Calibration:
 def test_a_certificate_read_from_its_file_has_the_same_arms_covariance_and_gauge(tmp_path: Path) -> None:
     found = identification()
     path = tmp_path / "new.yaml"
-    write(path, certificate(found, found.arms))
+    write(path, certificate(found, found.arms), None)
     read = read_calibration(path, "50-0017")
     assert read.created == WHEN
     assert read.size_effect is not None
@@ -119,7 +117,7 @@ def test_the_certificate_keeps_the_static_calibration_and_has_the_provenance_of_
         "x_minus_y": pytest.approx([46.25, -40.25, -2.0]),
         "x_minus_z": pytest.approx([24.25, 6.5, -25.0]),
     }
-    assert how["residual_scatter_mm_s"] == {"z#1": 0.0}  # a constant offset is none
+    assert how["residual_scatter_mm_s"] == {"z": 0.0}  # a constant offset is none
 
 
 def test_nothing_is_certified_that_the_data_contradict() -> None:
@@ -132,7 +130,7 @@ def test_nothing_is_certified_on_increments_that_carry_dither() -> None:
     found = identification()
     shaken = replace(found.result.runs[0], H_rest=0.07)  # three arcsec of dither do this in ten seconds
     found = replace(found, result=replace(found.result, runs=(shaken,)))
-    with pytest.raises(InputError, match=r"no certificate: the gyro increments carry dither.*0\.07 \(z#1\)"):
+    with pytest.raises(InputError, match=r"no certificate: the gyro increments carry dither.*0\.07 \(z\)"):
         certificate(found, found.arms)
 
 
@@ -149,7 +147,7 @@ def test_another_units_certificate_is_not_written_over(tmp_path: Path) -> None:
     before = path.read_bytes()
     found = identification()
     with pytest.raises(InputError, match="got that of '50-0018'"):
-        write(path, certificate(found, found.arms))
+        write(path, certificate(found, found.arms), None)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
 
@@ -168,7 +166,7 @@ def test_the_units_own_certificate_is_kept_beside_the_new_one(tmp_path: Path) ->
     write_calibration(path, unit())
     before = path.read_bytes()
     found = identification()
-    write(path, certificate(found, found.arms))
+    write(path, certificate(found, found.arms), None)
     (kept,) = set(tmp_path.iterdir()) - {path}
     assert kept.read_bytes() == before
 

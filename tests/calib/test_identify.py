@@ -109,11 +109,12 @@ def test_plain_finds_them_as_the_literature_does(captured: tuple[list[Run], Arra
 def test_compensation_removes_nearly_all_of_the_velocity(captured: tuple[list[Run], Array]) -> None:
     for run in estimate_joint(captured[0]).runs:
         # the residual is the effect of bias and misalignment in 3 s
-        assert np.hypot(*run.compensated_n[:2]) < 0.05 * np.hypot(*run.V_n[:2])
+        (turn,) = run.turns
+        assert np.hypot(*turn.compensated_n[:2]) < 0.05 * np.hypot(*turn.V_n[:2])
         # the fitted velocity agrees within noise, a random walk over 25 s
         assert np.abs(run.v_n - run.fitted_n).max() < 1e-3
         assert len(run.t_s) == len(run.v_n) == len(run.fitted_n)
-    assert [run.rotation.axis for run in captured[0]] == ["+Z", "+X", "+Y"]
+    assert [run.turns[0].axis for run in captured[0]] == ["+Z", "+X", "+Y"]
 
 
 # --- observability ---

@@ -126,9 +126,9 @@ def test_a_long_rest_counts_as_several_and_a_long_motion_as_one(
             "axis 16.7 deg off the vertical, want at most 10",
         ),
         ([(20.0,), (2.5, 180.0), (8.0,)], "rest before 20.0 s, want 32"),
-        ([(40.0,), (2.5, 180.0), (3.0,)], "rest after 3.0 s, want 5"),
+        ([(40.0,), (2.5, 180.0), (2.5,)], "rest after 2.5 s, want 2.8"),
         ([(2.5, 180.0), (8.0,)], "no rest before it, want 32 s"),
-        ([(40.0,), (2.5, 180.0)], "no rest after it, want 5 s"),
+        ([(40.0,), (2.5, 180.0)], "no rest after it, want 2.8 s"),
     ],
 )
 def test_each_rejection_has_its_number_and_its_limit(
@@ -193,10 +193,10 @@ def test_two_pushes_with_a_short_pause_are_one_rotation(bench: Bench, step: Step
 
 
 def test_two_pushes_with_a_rest_between_are_both_rejected(bench: Bench, step: Step) -> None:
-    data = bench(step(40.0), step(1.3, 90.0), step(3.0), step(1.3, 90.0), step(8.0))
+    data = bench(step(40.0), step(1.3, 90.0), step(2.0), step(1.3, 90.0), step(8.0))
     first, second = (rejection_reasons(r, LIMITS) for r in find_segments([data]).rotations)
-    assert first == ("turned 90.0 deg, want 180 +- 5", "rest after 3.0 s, want 5")
-    assert second == ("turned 90.0 deg, want 180 +- 5", "rest before 3.0 s, want 32")
+    assert first == ("turned 90.0 deg, want 180 +- 5", "rest after 2.0 s, want 2.8")
+    assert second == ("turned 90.0 deg, want 180 +- 5", "rest before 2.0 s, want 32")
 
 
 def test_placing_the_unit_between_rotations_is_no_rotation(bench: Bench, step: Step) -> None:

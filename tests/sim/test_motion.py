@@ -10,7 +10,7 @@ from scipy.integrate import quad
 
 from imudrv.nav.attitude import rotation
 from imudrv.nav.earth import earth_rate_n
-from imudrv.sim.integrate import Body, Dithering, Integrals, Motion
+from imudrv.sim.integrate import Body, Dithering, Integrals, Motion, Shaking
 from imudrv.sim.path import cycles_at, split_cycles, start_attitude
 from imudrv.sim.scenario import Scenario, Start
 from imudrv.units import ARCSEC, DEG, NS, STANDARD_GRAVITY
@@ -27,8 +27,12 @@ ROCK = {
         "sway_mm": [5, 10, 15],
     }
 }
+WOBBLE = {
+    "rotate": {"angle_deg": 180.0, "duration_s": 2.5, "wobble_deg": 2.0, "wobble_hz": 3.0},
+}
 TURN = {"rotate": {"angle_deg": 180.0, "duration_s": 2.5, "axis_tilt_mrad": [3.0, -2.0]}}
 REST = {"rest": {"duration_s": 0.5}}
+STILL = Shaking((0.0, 0.0, 0.0), 0.0, np.zeros(2))
 
 
 def a_body(
@@ -37,6 +41,7 @@ def a_body(
     r_b: Any = None,
     amplitude_rad: Any = (0, 0, 0),
     earth: bool = True,
+    motor: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Body:
     hz = np.array([400.0, 390.0, 410.0])
     x, y, z = np.asarray(arm, np.float64).tolist()
@@ -45,6 +50,7 @@ def a_body(
         interval_s=interval_ns * NS,
         gravity=GRAVITY,
         omega_ie_n=(east, north, up) if earth else (0.0, 0.0, 0.0),
+        motor=Shaking(motor, 2 * pi * 25.0, split_cycles(25.0, interval_ns * NS)) if any(motor) else STILL,
         pivot_to_origin_b=(x, y, z),
         A=np.eye(3),
         r_b=np.zeros((3, 3)) if r_b is None else np.array(r_b, np.float64),
@@ -110,6 +116,27 @@ def test_a_turn_ends_at_rest_at_exactly_its_angle(scenario: Make) -> None:
     np.testing.assert_allclose(got.omega_ib_b[1400], got.omega_ib_b[999], atol=1e-17)
 
 
+def test_a_turn_wobbles_by_its_angle_and_ends_where_one_without_ends(scenario: Make) -> None:
+    got, smooth = run(scenario(WOBBLE)), run(scenario({"rotate": {"angle_deg": 180.0, "duration_s": 2.5}}))
+    np.testing.assert_allclose(got.C_nb[-1], smooth.C_nb[-1], atol=1e-15)
+    np.testing.assert_allclose(got.omega_ib_b[-1], smooth.omega_ib_b[-1], atol=1e-16)
+    off = np.arccos(np.clip(got.C_nb[:, 2, 2], -1.0, 1.0)) / DEG
+    # two elementary rotations of 2 deg, a quarter cycle apart: a cone of 2 deg, to the second order
+    np.testing.assert_allclose(off[700:1800], 2.0, atol=2e-3)
+    assert off[-1] < 1e-6
+
+
+def test_a_motor_shakes_the_pivot_at_rest_and_in_a_turn(scenario: Make) -> None:
+    amplitude = (0.01, 0.02, -0.03)
+    for motion in (REST, TURN):
+        still, shaken = run(scenario(motion)), run(scenario(motion), motor=amplitude)
+        f_n = np.einsum("nij,nj->ni", still.C_nb, shaken.dv_b - still.dv_b) / 1e-3
+        t = 1e-3 * (np.arange(len(f_n)) + 0.5)
+        # a mean over 1 ms is the middle but for (2 pi 25 Hz 1 ms)^2 / 24 = 1e-3; 1.4 rad/s turns 0.7 mrad
+        expected = np.outer(np.sin(2 * pi * 25.0 * t), amplitude)
+        np.testing.assert_allclose(f_n, expected, atol=0.03 * 2e-3)
+
+
 def test_rocking_ends_at_rest_where_it_began(scenario: Make) -> None:
     got = run(scenario(ROCK, start={"heading_deg": 20.0}))
     np.testing.assert_allclose(got.C_nb[-1], start_attitude(Start(heading_deg=20.0)), atol=1e-15)
@@ -117,7 +144,7 @@ def test_rocking_ends_at_rest_where_it_began(scenario: Make) -> None:
     assert np.abs(got.omega_ib_b).max() > 1.0
 
 
-@pytest.mark.parametrize("motion", [ROCK, TURN], ids=["rock", "turn"])
+@pytest.mark.parametrize("motion", [ROCK, TURN, WOBBLE], ids=["rock", "turn", "wobble"])
 def test_the_rate_is_the_derivative_of_the_attitude(scenario: Make, motion: dict[str, Any]) -> None:
     h = 1e-4
     got = run(scenario(motion), interval_ns=100_000)
@@ -134,7 +161,7 @@ def test_the_rate_is_the_derivative_of_the_attitude(scenario: Make, motion: dict
 
 
 @pytest.mark.parametrize("amplitude", [0.0, 100 * ARCSEC], ids=["no dither", "dither"])
-@pytest.mark.parametrize("motion", [ROCK, TURN], ids=["rock", "turn"])
+@pytest.mark.parametrize("motion", [ROCK, TURN, WOBBLE], ids=["rock", "turn", "wobble"])
 def test_the_arms_feel_omega_dot_and_omega_squared(
     scenario: Make, motion: dict[str, Any], amplitude: float
 ) -> None:

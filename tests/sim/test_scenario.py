@@ -9,7 +9,7 @@ from imudrv.calibration import Calibration
 from imudrv.errors import FaultyFileError, InputError
 from imudrv.files.settings_file import write
 from imudrv.sim.scenario import NOMINAL, Scenario, load, shipped
-from imudrv.sim.unit import simulate
+from imudrv.sim.unit import draw_true_unit, simulate
 
 Make = Callable[..., Scenario]
 TEXT = """\
@@ -19,6 +19,7 @@ site: {latitude_deg: 28.2, longitude_deg: 113.0, height_m: 60.0}
 motion:
   - rest: {duration_s: 1}
 """
+HALF_TURN = {"angle_deg": 180.0, "duration_s": 2.0}
 
 
 @pytest.mark.parametrize("name", shipped())
@@ -62,7 +63,7 @@ def test_a_missing_calibration_file_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("motion", "sections", "message"),
     [
-        ({}, {}, "expected one of rest, rotate, rock, vibrate, got none"),
+        ({}, {}, "expected one of rest, rotate, turns, rock, vibrate, got none"),
         (
             {"rest": {"duration_s": 1.0}, "rotate": {"angle_deg": 1.0, "duration_s": 1.0}},
             {},
@@ -105,6 +106,18 @@ def test_a_missing_calibration_file_is_named(tmp_path: Path) -> None:
             {"unit": {"temperature": {"settles_at_degc": 9.0}}},
             "together, got one of them",
         ),
+        (
+            {"rest": {"duration_s": 1.0}},
+            {"faults": {"restarts": [{"at_s": 1.0, "duration_s": 2.0}, {"at_s": 2.5, "duration_s": 1.0}]}},
+            "restarts: expected one after the other",
+        ),
+        (
+            {"rotate": {"angle_deg": 180.0, "duration_s": 2.0, "wobble_deg": 21.0}},
+            {},
+            "wobble_deg",
+        ),
+        ({"turns": {"count": 101, "arrest_s": 4.0, "rotate": HALF_TURN}}, {}, "count"),
+        ({"rest": {"duration_s": 1.0}}, {"motor": {"frequency_hz": 2001.0, "mg": [1, 1, 1]}}, "frequency_hz"),
         ({"rest": {"duration_s": 1.0}}, {"unit": {"noize": {}}}, "noize"),
         ({"rest": {"duration_s": 1.0}}, {"start": {"pose": "upside_down"}}, "pose"),
     ],
@@ -120,3 +133,25 @@ def test_two_calibrations_are_one_too_many(scenario: Make) -> None:
     inline = NOMINAL.model_dump(mode="json", exclude_none=True)
     with pytest.raises(FaultyFileError, match="expected calibration_file or calibration, got both"):
         scenario({"rest": {"duration_s": 1.0}}, unit={"calibration": inline, "calibration_file": "a.yaml"})
+
+
+def test_many_turns_are_rotations_to_and_fro_with_a_rest_after_each(scenario: Make) -> None:
+    turns = scenario({"turns": {"count": 3, "arrest_s": 4.0, "rotate": HALF_TURN}}).motions
+    assert [type(motion).__name__ for motion in turns] == ["Rotate", "Rest"] * 3
+    assert [motion.angle_deg for motion in turns[::2]] == [180.0, -180.0, 180.0]
+    assert {motion.duration_s for motion in turns[1::2]} == {4.0}
+    same_way = scenario({"turns": {"count": 2, "arrest_s": 4.0, "rotate": HALF_TURN, "alternate": False}})
+    assert [motion.angle_deg for motion in same_way.motions[::2]] == [180.0, 180.0]
+
+
+def test_more_motions_than_a_scenario_may_have_are_refused(scenario: Make) -> None:
+    turns = {"turns": {"count": 100, "arrest_s": 4.0, "rotate": HALF_TURN}}
+    with pytest.raises(FaultyFileError, match="expected at most 1000 rotations and rests, got 1200"):
+        scenario(*[turns] * 6)
+
+
+def test_the_three_poses_of_the_bench_procedure_are_of_one_unit() -> None:
+    layout = profiles.load("imu50-rs422").layout()
+    units = [draw_true_unit(load(name), layout) for name in ("z-up", "x-up", "y-up")]
+    assert len({unit.C_ba.tobytes() for unit in units}) == 1
+    assert len({load(name).seed for name in ("z-up", "x-up", "y-up")}) == 3  # noise of their own

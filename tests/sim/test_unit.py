@@ -269,6 +269,75 @@ def test_the_counter_starts_and_jumps_where_it_should_and_warm_up_ends(scenario:
     np.testing.assert_array_equal(got.pulses["status"] == STATUS_WARM_UP, np.arange(2000) < 250)
 
 
+def test_a_unit_that_restarts_counts_from_zero_and_warms_up_again(scenario: Make) -> None:
+    faults = {
+        "restarts": [{"at_s": 0.6, "duration_s": 0.4}],
+        "counter_jumps": [{"at_s": 0.5, "by": 100}, {"at_s": 1.5, "by": 10}],
+    }
+    got = run(scenario(REST, start={"counter": 5000}, faults=faults, unit={"warm_up_s": 0.25}))
+    counter = got.pulses["counter"]
+    assert counter[0] == 5000
+    np.testing.assert_array_equal(counter[1000:1500], np.arange(500))
+    np.testing.assert_array_equal(counter[1500:], np.arange(510, 1010))
+    warm_up = np.flatnonzero(got.pulses["status"] == STATUS_WARM_UP)
+    np.testing.assert_array_equal(warm_up, [*range(250), *range(1000, 1250)])
+
+
+def test_biases_step_where_they_should_and_by_their_amounts(scenario: Make) -> None:
+    steps = [
+        {"at_s": 0.5, "gyro_deg_per_h": [100.0, 0.0, -50.0], "accelerometer_ug": [0.0, 3e4, -1e4]},
+        {"at_s": 1.0, "accelerometer_ug": [2e4, 0.0, 0.0]},
+    ]
+    plain, stepped = (
+        run(scenario(REST, unit={"calibration": FINE, "bias_steps": some})).pulses for some in ([], steps)
+    )
+
+    def change(axis: str, part: slice) -> np.ndarray:
+        return (stepped[axis][part] - plain[axis][part]).sum(axis=0)
+
+    K, k_g = np.array([2e6, 3e6, 1e6]), np.array([0.001, 0.002, 0.0015]) * ARCSEC
+    assert not change("gyro", slice(0, 500)).any()
+    # a pulse of rounding at each end
+    G = np.linalg.inv(FINE["gyro"]["C_bg"])
+    expected = G @ (np.array([100.0, 0.0, -50.0]) * DEG_PER_H * 1.5) / k_g
+    np.testing.assert_allclose(change("gyro", slice(500, 2000)), expected, atol=2)
+    expected = np.array([2e4 * 1.0, 3e4 * 1.5, -1e4 * 1.5]) * UG * K
+    np.testing.assert_allclose(change("accelerometer", slice(500, 2000)), expected, atol=2)
+
+
+def test_a_unit_drifts_with_temperature_though_its_calibration_does_not_know(scenario: Make) -> None:
+    slopes = {
+        "gyro_bias_deg_per_h_per_k": 0.05,
+        "gyro_scale_ppm_per_k": 2.0,
+        "accelerometer_bias_ug_per_k": 30.0,
+        "accelerometer_scale_ppm_per_k": 5.0,
+    }
+    drawn = [
+        draw_true_unit(scenario(REST, seed=seed, unit={"residuals": slopes}), LAYOUT).temperature
+        for seed in range(200)
+    ]
+    assert all(terms.reference_degc == 35.0 for terms in drawn)  # temperature.start_degc
+    # 600 draws: four sigma of the standard deviation are 4 / sqrt(1200)
+    assert np.std([t.gyro_bias for t in drawn]) == pytest.approx(0.05 * DEG_PER_H, rel=0.12)
+    assert np.std([t.gyro_scale for t in drawn]) == pytest.approx(2.0 * PPM, rel=0.12)
+    assert np.std([t.accelerometer_bias for t in drawn]) == pytest.approx(30.0 * UG, rel=0.12)
+    assert np.std([t.accelerometer_scale for t in drawn]) == pytest.approx(5.0 * PPM, rel=0.12)
+    assert draw_true_unit(scenario(REST), LAYOUT).temperature is None
+
+
+def test_true_points_may_differ_from_those_of_the_calibration(scenario: Make) -> None:
+    true = {"x": [1.0, 2.0, 3.0], "y": [4.0, 5.0, 6.0], "z": [7.0, 8.0, 9.0]}
+    bare = {key: value for key, value in FINE.items() if key != "size_effect"}
+    unit = draw_true_unit(scenario(REST, unit={"calibration": bare, "r_mm": true}), LAYOUT)
+    np.testing.assert_allclose(unit.r_b, np.arange(1, 10).reshape(3, 3) * 1e-3, rtol=1e-15)
+
+
+def test_the_seed_of_the_unit_draws_its_residuals_alone(scenario: Make) -> None:
+    of_unit = {"seed": 11, "residuals": {"accelerometer_bias_ug": 50.0}}
+    one, other = (draw_true_unit(scenario(REST, seed=s, unit=of_unit), LAYOUT) for s in (1, 2))
+    np.testing.assert_array_equal(one.accelerometer_bias, other.accelerometer_bias)
+
+
 def test_a_slower_unit_counts_the_same_motion(scenario: Make) -> None:
     fast, slow = run(scenario(REST, TURN)), run(scenario(REST, TURN), interval_ns=2_500_000)
     assert slow.pulses.size == 1400

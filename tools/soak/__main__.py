@@ -8,6 +8,7 @@
     tools/run python -m tools.soak faults [--seconds 20]       the same counts offline, live and recorded
     tools/run python -m tools.soak kill [--times 20]           recordings after kill -9
     tools/run python -m tools.soak unplug [--seconds 15]       and full disk, stuck and absent receivers
+    tools/run python -m tools.soak hostile [--minutes 30]      clients, calibrations, recordings, sockets
     tools/run python -m tools.soak hours [--hours 10]          in virtual time
 
 Run it in the folder of the project. Each test prints what is required and what was found; the exit code is 1
@@ -24,6 +25,7 @@ from typing import Final, NamedTuple
 
 from .checks import Check, StepError
 from .disruption import disruption
+from .hostile import hostile
 from .kill import kill
 from .line_faults import line_faults
 from .loopback import loopback
@@ -50,6 +52,7 @@ TESTS: Final = {
     "faults": SoakTest(line_faults, "--seconds", 20, "the same counts offline, live and recorded"),
     "kill": SoakTest(kill, "--times", 20, "recordings after kill -9"),
     "unplug": SoakTest(disruption, "--seconds", 15, "unplugged port, full disk, stuck and absent receivers"),
+    "hostile": SoakTest(hostile, "--minutes", 30, "40 clients that do not read, calibrations, deleted files"),
     "hours": SoakTest(virtual_hours, "--hours", 10, "counts and memory over hours of virtual time"),
 }
 
