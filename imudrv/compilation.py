@@ -120,7 +120,7 @@ def compile_all() -> bool:
 @contextmanager
 def _progress() -> Iterator[Callable[[int], None]]:
     """Yield a function that shows the number of finished parts: on a terminal anew, elsewhere once."""
-    stream, said = sys.stderr, False
+    stream, said = sys.__stderr__, False  # a progress bar of the command may have taken the other one
 
     def advance(finished: int) -> None:
         nonlocal said
