@@ -76,9 +76,13 @@ def messages() -> None:
 
 
 def simulation() -> None:
-    """A simulated unit."""
-    for _ in wire(Scenario.model_validate(_SCENARIO), _BYTES.layout()):
-        pass
+    """A simulated unit, with and without a size effect."""
+    scenario = Scenario.model_validate(_SCENARIO)
+    calibration = nominal(_BYTES.layout()).without_size_effect()
+    unit = scenario.unit.model_copy(update={"calibration": calibration})
+    for one in (scenario, scenario.model_copy(update={"unit": unit})):
+        for _ in wire(one, _BYTES.layout()):
+            pass
 
 
 def clock() -> None:

@@ -177,6 +177,7 @@ def test_after_the_warm_up_no_command_compiles_a_kernel(cache: Path, tmp_path: P
         "calib identify x.raw y.raw z.raw --profile imu50-rs422 --calibration unit.yaml --site site.yaml "
         "-o new.yaml",
         "calib run --rehearse --speed max --session session",
+        "calib validate --simulate rotation",
     ):
         done = run("-m", *line.split(), cwd=tmp_path, NUMBA_CACHE_DIR=str(cache))
         assert done.returncode == 0, f"{line}: {done.stderr}"
