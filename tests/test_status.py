@@ -15,7 +15,7 @@ from imudrv.errors import InputError
 from imudrv.hostclock import now_ns
 from imudrv.profiles import load
 from imudrv.records import PULSES
-from imudrv.service.loop import POLL_NS, Service
+from imudrv.service.loop import HOUSEKEEPING_NS, Service
 from imudrv.service.settings import Settings
 from imudrv.service.status import Status, UnitStatus
 from imudrv.service.status_socket import StatusServer, ask
@@ -54,13 +54,13 @@ def test_an_event_is_published_at_once_and_the_rate_is_still_over_a_whole_second
         os.write(master, wire)  # 100 frames of 38 bytes are less than a pty holds
         for _ in range(10):  # one read, or more if the system cuts the bytes
             service.step()
-        clock.t_ns += NS_PER_S - POLL_NS
+        clock.t_ns += NS_PER_S - HOUSEKEEPING_NS
         os.close(slave)
         os.close(master)
         service.step()
         assert "port lost" in service.status.events[-1]
         assert service.status.rate_hz == 0.0
-        clock.t_ns += POLL_NS
+        clock.t_ns += HOUSEKEEPING_NS
         service.step()
         assert service.status.samples.good == 100
         assert service.status.rate_hz == 100.0

@@ -343,8 +343,9 @@ def live(transport: type[Line] | type[Bus], seconds: int, rounds: int) -> dict[s
     Returns
     -------
     dict
-        Of each contestant quantiles of the latency, s, and the part of a core that it took; and the ratios of
-        the quantiles to those of the first one.
+        Of each contestant quantiles of the latency, s, and the part of a core that it took, each the median
+        over its rounds, so that a disturbance of one round does not decide; and the ratios of the quantiles
+        to those of the first one.
     """
     if seconds * 1000 > 1 << 16:
         raise SystemExit("expected rounds of 65 s at most: a counter of 16 bits repeats itself")
@@ -356,9 +357,11 @@ def live(transport: type[Line] | type[Bus], seconds: int, rounds: int) -> dict[s
                 all_rounds.append(one_round(transport, seconds * 1000, which, Path(name)))
     result = {}
     for which, all_rounds in taken.items():
-        latency_s = np.concatenate([one.latency_s for one in all_rounds])
-        result[which] = {name: float(np.quantile(latency_s, q)) for name, q in quantiles.items()}
-        result[which]["cpu"] = float(np.mean([one.cpu for one in all_rounds]))
+        result[which] = {
+            name: float(np.median([np.quantile(one.latency_s, q) for one in all_rounds]))
+            for name, q in quantiles.items()
+        }
+        result[which]["cpu"] = float(np.median([one.cpu for one in all_rounds]))
     first = next(iter(taken))
     for which in list(taken)[1:]:
         ratios = {name: result[which][name] / result[first][name] for name in quantiles}

@@ -16,7 +16,7 @@ import zstandard
 from imudrv.capture_files.recognise import GZIP, ZSTANDARD, Kind
 from imudrv.errors import InputError
 
-CHUNK_BYTES: Final = 1 << 17
+CHUNK_BYTES: Final = 1 << 18
 """Bytes read at once: few enough for the cache, many enough that Python's overhead does not matter."""
 LONGEST_LINE: Final = 1 << 16
 """Maximum length of a line, bytes."""

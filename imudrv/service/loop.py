@@ -1,8 +1,9 @@
 """The live service: connects port, decoding, compensation, sinks and recording.
 
 One thread reads, stamps, decodes, compensates and publishes, driven by samples and not by a timer. What the
-system has held back arrives as one batch and is processed as one. Everything else is done between two reads,
-fifty times a second, in microseconds.
+system has held back arrives as one batch and is processed as one. Everything else is done between two reads:
+ten times a second, since Python's code leaves cold caches to the sample after it, and more often while an
+output is behind.
 
 A port with a descriptor is served by a kernel (`imudrv.service.serve`), which returns for all that is not a
 read, its samples and their datagrams. Other ports are read by Python. Both use the kernels of `imudrv.chain`.
@@ -56,8 +57,11 @@ from imudrv.sinks.history import History
 from imudrv.sinks.recorder import Recorder
 from imudrv.units import NS, NS_PER_S
 
+HOUSEKEEPING_NS: Final = NS_PER_S // 10
+"""Time between two rounds of housekeeping; with the 50 ms of the writing thread it leaves a recording that is
+complete up to 0.25 s ago."""
 POLL_NS: Final = NS_PER_S // 50
-"""Time between two rounds of housekeeping, and the longest wait for data."""
+"""The same while an output has samples queued, and the longest wait of Python for data."""
 
 
 class Service:
@@ -206,8 +210,9 @@ class Service:
             self._process(arrival)
         now = self._clock()
         if now >= self._next_poll_ns:
-            self._next_poll_ns = now + POLL_NS
             self._poll(now)
+            is_behind = any(sink.state.queued for sink in self._sinks)
+            self._next_poll_ns = now + (POLL_NS if is_behind else HOUSEKEEPING_NS)
         return True
 
     def close(self) -> None:
@@ -279,6 +284,8 @@ class Service:
             self._take(served, [len(some) for some in outlets])
         if served.error:
             self._port.failed(served.error)
+        if served.why is Why.OUTLET:
+            self._next_poll_ns = 0  # soon again, if it is behind now
         return served.why is not Why.CLOCKS
 
     def _take(self, served: Served, outlets: Sequence[int]) -> None:
