@@ -228,8 +228,8 @@ def play(unit: Line | Bus, sent_ns: NDArray[np.int64]) -> None:
 
 
 def receive(inlet: socket.socket, echo: Echo, received_ns: NDArray[np.int64]) -> None:
-    """Store the time at which each sample arrives, until none does for 2 s."""
-    inlet.settimeout(2.0)
+    """Store the time at which each sample arrives, until none does for 2 s; the first may take 20 s."""
+    inlet.settimeout(20.0)
     buffer, rest = bytearray(1 << 17), 0
     while True:
         try:
@@ -237,6 +237,7 @@ def receive(inlet: socket.socket, echo: Echo, received_ns: NDArray[np.int64]) ->
         except TimeoutError:
             return
         now = time.monotonic_ns()
+        inlet.settimeout(2.0)
         at = 0
         while at + echo.stride <= stop:
             begin = at + echo.counter_at

@@ -2,7 +2,7 @@
 
 One thread reads, stamps, decodes, compensates and publishes, driven by samples and not by a timer. What the
 system has held back arrives as one batch and is processed as one. Everything else is done between two reads:
-ten times a second, since Python's code leaves cold caches to the sample after it, and more often while an
+eight times a second, since Python's code leaves cold caches to the sample after it, and more often while an
 output is behind.
 
 A port with a descriptor is served by a kernel (`imudrv.service.serve`), which returns for all that is not a
@@ -57,7 +57,7 @@ from imudrv.sinks.history import History
 from imudrv.sinks.recorder import Recorder
 from imudrv.units import NS, NS_PER_S
 
-HOUSEKEEPING_NS: Final = NS_PER_S // 10
+HOUSEKEEPING_NS: Final = NS_PER_S // 8
 """Time between two rounds of housekeeping; with the 50 ms of the writing thread it leaves a recording that is
 complete up to 0.25 s ago."""
 POLL_NS: Final = NS_PER_S // 50

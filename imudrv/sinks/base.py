@@ -104,7 +104,7 @@ class Sink(ABC):
     Attributes
     ----------
     is_patient : bool
-        Whether `publish` may be called up to 0.1 s after a batch arrived; otherwise it is called at once,
+        Whether `publish` may be called up to 0.13 s after a batch arrived; otherwise it is called at once,
         which costs the loop time.
     """
 
@@ -127,7 +127,7 @@ class Sink(ABC):
         Parameters
         ----------
         batch : Batch
-            The samples, up to 0.1 s old.
+            The samples, up to 0.13 s old.
         outlets : list of Written
             One for each of `outlets`.
         """
@@ -136,7 +136,7 @@ class Sink(ABC):
     def poll(self) -> None:
         """Accept clients, send what is queued, reopen devices.
 
-        Called ten times a second, and fifty times while `state` tells of samples in the queue.
+        Called eight times a second, and fifty times while `state` tells of samples in the queue.
         """
         return
 
