@@ -1,5 +1,7 @@
 """After the steps: result, the operator's decision, activation of the certificate, and report."""
 
+from typing import Final
+
 from calib.bench.entries import ResidualVelocity
 from calib.bench.keys import Keyboard
 from calib.bench.queue_sink import QueueReader
@@ -9,11 +11,19 @@ from calib.bench.session import Session
 from calib.bench.state import REPORT, RESULT
 from calib.certificate import check_target, write
 from calib.lever_arms.gauge import convert
+from calib.messages import english, message
 from calib.reports.identification import arms_text, report_html, verdict
 from imudrv.calibration import Calibration, read_calibration
 from imudrv.errors import InputError
 from imudrv.files import atomic, settings_file
 from imudrv.files.atomic import atomic_write
+
+_MARKS: Final = {
+    "good": message("mark_good"),
+    "note": message("mark_note"),
+    "caution": message("mark_caution"),
+    "bad": message("mark_bad"),
+}
 
 
 def session_result(session: Session) -> Result:
@@ -55,7 +65,7 @@ def ask_operator(unit: str, screen: OperatorScreen, keys: Keyboard, queue: Queue
     ServiceEndedError
         The service has ended before the answer.
     """
-    screen.print(f"Accept it as the certificate of unit {unit}? [y/n]")
+    screen.say(message("accept", unit=unit))
     while not screen.is_idle:
         queue.take()
     keys.read()  # keys pressed before the question are no answer to it
@@ -66,10 +76,11 @@ def ask_operator(unit: str, screen: OperatorScreen, keys: Keyboard, queue: Queue
                 return key == "y"
 
 
-def summary(result: Result) -> str:
-    """Return the text on which the operator decides."""
-    verdicts = [f"{mark}: {text}" for mark, text in verdict(result.identification)]
-    return "\n".join([arms_text(result.identification.arms), *verdicts])
+def summarise(result: Result, screen: OperatorScreen) -> None:
+    """Print what the operator needs for the decision."""
+    screen.print(arms_text(result.identification.arms))
+    for mark, text in verdict(result.identification):
+        screen.say(message("mark", mark=_MARKS[mark], text=text))
 
 
 def activate(session: Session, certificate: Calibration) -> None:
@@ -105,7 +116,7 @@ def write_report(session: Session, result: Result, residual: ResidualVelocity | 
     html = report_html(result.identification, (arms, convert(arms, "x")))
     text = "The verification was skipped."
     if residual is not None:
-        text = f"One more rotation with the new certificate: {residual}."
+        text = f"One more rotation with the new certificate: {english(residual.message)}."
     section = f"<section>\n<h2>Verification</h2>\n<p>{text}</p>\n</section>"
     with atomic_write(session.path(REPORT)) as file:
         file.write(html.replace("</section>", f"</section>\n{section}", 1).encode())

@@ -29,7 +29,7 @@ from calib.bench.completion import (
     ask_operator,
     decide_alone,
     session_result,
-    summary,
+    summarise,
     write_report,
 )
 from calib.bench.entries import Counted, Decision, ServiceMessage, SessionEnded, UnitDetected
@@ -41,7 +41,7 @@ from calib.bench.resume import require_temperature
 from calib.bench.screen import OperatorScreen, with_port_state
 from calib.bench.session import Session
 from calib.bench.state import REPORT
-from calib.messages import english
+from calib.messages import Message, english, message
 from calib.procedure.engine import Engine
 from calib.procedure.events import Aborted, Accepted, Conditions, Entered, Event, Finished, Phase, Rejected
 from calib.procedure.plan import steps_left, verification
@@ -57,7 +57,7 @@ REDRAW_S: Final = 0.2
 """Interval at which the screen is redrawn and keys are read, s."""
 
 
-ABORT: Final = "q again: abort, accepted steps are kept. Any other key: continue"
+ABORT: Final = message("ask_abort")
 
 
 class SessionController:
@@ -85,7 +85,7 @@ class SessionController:
     ----------
     error : BaseException or None
         Error that ended the work.
-    outcome : str
+    outcome : tuple of Message
         Summary for the operator; empty if the session is not at its end.
     """
 
@@ -102,7 +102,7 @@ class SessionController:
         begin: Callable[[Procedure], None],
     ) -> None:
         self.error: BaseException | None = None
-        self.outcome = ""
+        self.outcome: tuple[Message, ...] = ()
         self._session, self._layout, self._service = session, layout, service
         self._procedure = procedure = session.procedure()
         self._steps = {step.id: step for step in (*procedure.steps, *verification(procedure).steps)}
@@ -137,12 +137,13 @@ class SessionController:
             if last.reasons:
                 raise InputError(f"no result: {'; '.join(map(english, last.reasons))}; resume the session")
             session.append(last)
-        self._screen.print("Computing the lever arms from the recordings ...")
+        self._screen.say(message("computing"))
         result = session_result(session)
         if self._sink.is_closed:
             raise ServiceEndedError  # nothing is decided after Ctrl-C
         if not self._is_accepted(result):
-            self.outcome = f"rejected; certificate unchanged: {session.plan.certificate.path}"
+            path = str(session.plan.certificate.path)
+            self.outcome = (message("result_rejected", path=path),)
             return
         activate(session, result.certificate)
         last = self._run_steps(verification(self._procedure))
@@ -153,17 +154,18 @@ class SessionController:
             residual = residual_velocity(session, result.certificate)
         write_report(session, result, residual)
         session.end(SessionEnded(residual))
+        verified = message("verification_skipped") if residual is None else residual.message
         self.outcome = (
-            f"active certificate: {session.plan.certificate.path}\n"
-            f"verification: {residual or 'skipped'}\n"
-            f"report: {session.folder / REPORT}"
+            message("active_certificate", path=str(session.plan.certificate.path)),
+            message("verification", result=verified),
+            message("report", path=str(session.folder / REPORT)),
         )
 
     def _is_accepted(self, result: Result) -> bool:
         """Return the decision in the journal, or take it now."""
         decision = self._session.stage(Decision)
         if decision is None:
-            self._screen.print(summary(result))
+            summarise(result, self._screen)
             if self._hands_free:
                 decision = Decision(decide_alone(result))
             else:
@@ -204,7 +206,7 @@ class SessionController:
                 if events or is_due:
                     shown_s = time.monotonic()
                     view = with_port_state(engine.view, self._service.port_state)
-                    self._screen.show(view, ABORT if self._keys.asks else "")
+                    self._screen.show(view, ABORT if self._keys.asks else None)
         except ServiceEndedError:
             self._recordings.record_closed()
             raise
@@ -262,7 +264,7 @@ class SessionController:
                 self._session.append(event)
         return last
 
-    def _file(self, engine: Engine, event: Accepted) -> str:
+    def _file(self, engine: Engine, event: Accepted) -> Message | None:
         """File an accepted attempt; return why that is impossible."""
         log = next(log for log in reversed(engine.runs) if log.step_id == event.step_id)
         degc = self._conditions.temperature_degc

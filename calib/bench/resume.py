@@ -11,6 +11,7 @@ from calib.bench.entries import EmbeddedFile, Resumed
 from calib.bench.session import Session
 from calib.bench.state import RESULT
 from calib.bench.verify import faulty_files
+from calib.messages import Message, message, text
 from imudrv import profiles
 from imudrv.calibration import read_calibration_file
 from imudrv.errors import InputError
@@ -79,6 +80,12 @@ def require_same(
         )
 
 
+def steps_message(session: Session) -> Message:
+    """Return the accepted steps of a session."""
+    accepted = tuple(session.accepted)
+    return message("steps", ids=accepted) if accepted else message("none")
+
+
 def require_temperature(session: Session, degc: Mapping[str, float | None]) -> None:
     """Refuse to resume a session at another temperature than that of the accepted runs.
 
@@ -107,7 +114,7 @@ def require_temperature(session: Session, degc: Mapping[str, float | None]) -> N
             )
 
 
-def resume(session: Session, console: Console, redo: Sequence[str], *, asks: bool) -> None:
+def resume(session: Session, console: Console, redo: Sequence[str], language: str, *, asks: bool) -> None:
     """Report the progress of a session, ask whether to resume it, and withdraw the steps to be done again.
 
     Parameters
@@ -118,6 +125,8 @@ def resume(session: Session, console: Console, redo: Sequence[str], *, asks: boo
         Terminal of the operator.
     redo : sequence of str
         Steps to be done again.
+    language : str
+        Language of the operator.
     asks : bool
         The operator is asked; otherwise the session is resumed at once.
 
@@ -126,13 +135,13 @@ def resume(session: Session, console: Console, redo: Sequence[str], *, asks: boo
     InputError
         The operator declines, or a step does not exist.
     """
-    lines = [session.dropped] if session.dropped else []
-    accepted = ", ".join(session.accepted) or "none yet"
-    plan = session.plan
-    lines.append(f"session {session.folder} of unit {plan.unit}: accepted steps: {accepted}")
-    lines.append(f"port {plan.port}, active certificate {plan.certificate.path}")
+    plan, lines = session.plan, [session.dropped] if session.dropped else []
+    state = message("resume_state", folder=str(session.folder), unit=plan.unit, steps=steps_message(session))
+    port = message("resume_port", port=plan.port, certificate=str(plan.certificate.path))
+    lines += [text(state, language), text(port, language)]
     console.print("\n".join(lines), markup=False, soft_wrap=True)
-    if asks and console.input("resume it? [y/n] ", markup=False).strip().lower() not in ("y", "yes"):
+    question = text(message("resume"), language)
+    if asks and console.input(question, markup=False).strip().lower() not in ("y", "yes"):
         raise InputError(f"{session.folder}: not resumed and not changed; name another folder to begin anew")
     session.redo(redo)
     session.append(Resumed(session.record_leftovers()))

@@ -34,6 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="only show the steps, how long they take, and the expected accuracy",
     )
     add("--hands-free", action="store_true", help="continue by the sensors alone, without keys")
+    add("--language", metavar="L", help="en or zh_CN; default: the system's")
     add("--rehearse", action="store_true", help="use a simulated unit and technician")
     add("--speed", default="1", metavar="X", help="speed of the rehearsal: 1, 10, ... or max")
 

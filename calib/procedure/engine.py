@@ -23,7 +23,7 @@ from collections.abc import Mapping
 
 from calib.detection.blocks import Block, BlockSplitter
 from calib.detection.tracking import MG, AttitudeTracker, StillnessDetector
-from calib.messages import message, verbatim
+from calib.messages import Message, message
 from calib.procedure.events import (
     Abort,
     Aborted,
@@ -140,14 +140,14 @@ class Engine:
                 self._follow(Outcome.PLACED)
         return self._new_events()
 
-    def reject(self, step_id: str, reason: str) -> tuple[Event, ...]:
+    def reject(self, step_id: str, reason: Message) -> tuple[Event, ...]:
         """Withdraw an accepted step, because its recording is not complete; it has to be done again.
 
         Parameters
         ----------
         step_id : str
             An accepted step.
-        reason : str
+        reason : Message
             For the operator.
 
         Returns
@@ -159,7 +159,7 @@ class Engine:
             p = self._progress
             del p.accepted[step_id]
             p.index = self._index(step_id)
-            self._follow(p.reject(verbatim(reason)))
+            self._follow(p.reject(reason))
         return self._new_events()
 
     @property

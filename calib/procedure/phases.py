@@ -13,7 +13,7 @@ from calib.detection.segments import LEAST_FORCE, QUIET_S, SIGMAS, Rotation
 from calib.detection.tracking import MG, RestAverages
 from calib.estimation.linear_system import GAIN_WINDOW_S
 from calib.estimation.runs import GUARD_S, Priors
-from calib.messages import Message, message, verbatim
+from calib.messages import Message, message
 from calib.procedure import prompts
 from calib.procedure.attempt import Attempt
 from calib.procedure.events import PREFLIGHT, Accepted, Checked, Phase, Rejected, Turned
@@ -215,9 +215,10 @@ class Aligning(PhaseState):
         try:
             aligned = self._alignment.result()
         except InputError as error:
-            return p.restart(*faults, verbatim(str(error)))
+            return p.restart(*faults, message("alignment_failed", why=str(error)))
         if self._alignment.done and aligned.motion:
-            faults = (*faults, verbatim(aligned.motion))
+            moved = aligned.motion
+            faults = (*faults, message("moved_at_rest", begin_s=moved.begin_s, end_s=moved.end_s))
         attempt.aligned = aligned
         w, x, y, z = aligned.q_nb.tolist()
         p.attitude.q_nb = w, x, y, z

@@ -32,7 +32,7 @@ from calib.bench.screen import OperatorScreen, plain
 from calib.bench.session import Session
 from calib.bench.technician import BENCH, Mistake, technician_scenario
 from calib.bench.verify import verify
-from calib.messages import english
+from calib.messages import Message, english
 from calib.procedure.events import Accepted, Entered, Phase, Rejected, View
 from calib.procedure.plan import steps_left
 from calib.procedure.schema import Procedure
@@ -130,7 +130,7 @@ class Shown(OperatorScreen):
         super().__init__(Console(file=self.text, width=200))
         self._typed = keys
 
-    def show(self, view: View, question: str = "") -> None:
+    def show(self, view: View, question: Message | None = None) -> None:
         super().show(view, question)
         while not self.is_idle:
             sleep(0.001)
@@ -267,7 +267,7 @@ def test_an_aborted_session_can_be_resumed(
     conduct, text = conducted(session, list(batches), keys)
     assert "q again: abort" in text
     assert conduct.error is None
-    assert conduct.outcome == ""
+    assert conduct.outcome == ()
     assert sorted(events(session)[-2:]) == ["aborted", "file"]
     assert session.next_attempt("z-up") == 2
     assert not session.is_over
@@ -437,7 +437,7 @@ def found(monkeypatch: pytest.MonkeyPatch) -> None:
 
     nothing: Any = None
     monkeypatch.setattr(completion, "identify_session", lambda _: Result(nothing, NOMINAL))
-    monkeypatch.setattr(controllers, "summary", lambda _: "a result")
+    monkeypatch.setattr(controllers, "summarise", lambda *_: None)
 
 
 def test_a_result_that_is_rejected_changes_nothing(
@@ -446,7 +446,7 @@ def test_a_result_that_is_rejected_changes_nothing(
     before = session.plan.certificate.path.read_bytes()
     monkeypatch.setattr(controllers, "decide_alone", lambda _: False)
     conduct, _ = conducted(session, list(batches), stopped=False)
-    assert "rejected; certificate unchanged" in conduct.outcome
+    assert [line.key for line in conduct.outcome] == ["result_rejected"]
     assert session.is_over
     assert session.plan.certificate.path.read_bytes() == before
 
@@ -455,7 +455,7 @@ def test_nothing_is_decided_after_ctrl_c(session: Session, batches: list[Batch],
     before = session.plan.certificate.path.read_bytes()
     conduct, _ = conducted(session, list(batches), stopped=True)
     assert conduct.error is None
-    assert conduct.outcome == ""
+    assert conduct.outcome == ()
     assert "certificate.yaml" in session.files
     assert "decision" not in events(session)
     assert session.plan.certificate.path.read_bytes() == before

@@ -10,7 +10,7 @@ import pytest
 
 from calib.detection.acceptance import rejection_reasons
 from calib.detection.segments import find_segments
-from calib.messages import english, message
+from calib.messages import english, message, verbatim
 from calib.procedure.engine import Engine
 from calib.procedure.events import (
     Abort,
@@ -385,7 +385,7 @@ def test_an_accepted_step_without_a_complete_recording_is_repeated(
     driver = drive(*poses).feed(turned)
     newest = int(turned["counter"][-1])
 
-    rejected, entered = driver.engine.reject("z", "the disk is full")
+    rejected, entered = driver.engine.reject("z", verbatim("the disk is full"))
 
     assert isinstance(rejected, Rejected)
     assert (rejected.step_id, rejected.attempt) == ("z", 1)
@@ -404,7 +404,7 @@ def test_an_accepted_step_without_a_complete_recording_is_repeated(
 def test_after_an_abort_no_step_is_repeated(drive: Drive, turned: Records) -> None:
     driver = drive(Z, X).feed(turned)
     driver.act(Abort())
-    assert driver.engine.reject("z", "the disk is full") == ()
+    assert driver.engine.reject("z", verbatim("the disk is full")) == ()
 
 
 def test_an_accepted_step_has_its_number_of_samples_without_lost_ones(drive: Drive, turned: Records) -> None:

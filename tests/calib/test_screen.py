@@ -5,18 +5,20 @@ import pty
 import sys
 import termios
 from collections.abc import Iterator
-from io import StringIO
+from dataclasses import replace
+from io import BytesIO, StringIO, TextIOWrapper
 from threading import Event
 from typing import Any
 
 import pytest
 from realtime import DEADLINE_S, until
+from rich.cells import cell_len
 from rich.console import Console
 
 from calib.bench import block_letters
 from calib.bench.keys import Keyboard
 from calib.bench.screen import NO_DATA, NO_FRAMES, OperatorScreen, plain, screen, with_port_state
-from calib.messages import english, verbatim
+from calib.messages import english, message, verbatim
 from calib.procedure.events import Abort, Confirm, Phase, Redo, Skip, View
 from imudrv.diagnosis import LineState
 
@@ -140,7 +142,7 @@ def test_bars_figures_and_reasons_are_on_the_screen() -> None:
 
 
 def test_a_question_replaces_the_keys() -> None:
-    assert rows(view(), question="once more: abort")[-1] == "once more: abort"
+    assert rows(view(), question=verbatim("once more: abort"))[-1] == "once more: abort"
 
 
 @pytest.mark.parametrize(
@@ -172,13 +174,42 @@ def test_a_terminal_without_blocks_gets_ascii() -> None:
         assert "\n".join(rows(view(headline=headline, progress=0.3), ascii_only=True)).isascii()
 
 
+def test_in_chinese_the_large_letters_stay_ascii_and_the_headline_is_repeated_below() -> None:
+    shown = replace(
+        view(Phase.ALIGN, remaining_s=75.0),
+        headline=message("aligning"),
+        hints=(message("do_not_touch"),),
+        reasons=(message("alignment_interrupted", elapsed_s=8.4, cause=message("unit_restarted")),) * 4,
+    )
+    out = StringIO()
+    console = Console(file=out, width=80, height=24, color_system=None)
+    console.print(screen(shown, 80, 24, language="zh_CN"))
+    drawn = out.getvalue().splitlines()
+
+    assert len(drawn) == 23
+    assert max(map(cell_len, drawn)) <= 80
+    assert "对准 1:15" in drawn[0]
+    assert "请勿触碰，正在对准" in drawn
+    assert drawn[-1] == "Enter: 确认   r: 重做   s: 跳过   q: 中止"
+    assert not any("请" in row for row in drawn[1:10])  # the large letters
+
+
+def test_a_terminal_of_ascii_gets_english() -> None:
+    out = TextIOWrapper(BytesIO(), "ascii")
+    shown = OperatorScreen(Console(file=out, width=80), "zh_CN")
+    shown.say(message("computing"))
+    shown.close()
+    out.seek(0)
+    assert out.read() == "Computing the lever arms from the recordings ...\n"
+
+
 def test_without_a_terminal_each_change_is_a_line() -> None:
     out = StringIO()
     shown = OperatorScreen(Console(file=out, width=80))
     shown.show(view(rate_deg_per_s=20.0, hints=("roll it over",)))
     shown.show(view(rate_deg_per_s=30.0, hints=("roll it over",), bells=1))
     shown.show(view(Phase.VERDICT, "REJECTED: DO IT AGAIN", reasons=("turned 150.0 deg, want 180 +- 5",)))
-    shown.show(view(Phase.VERDICT, "REJECTED: DO IT AGAIN"), question="once more: abort")
+    shown.show(view(Phase.VERDICT, "REJECTED: DO IT AGAIN"), question=verbatim("once more: abort"))
     shown.close()
     assert out.getvalue().splitlines() == [
         "step 2 of 3: X up, +180 deg | place: TURN IT: X UP | roll it over",

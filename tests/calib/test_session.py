@@ -626,10 +626,10 @@ def test_a_session_is_resumed_only_after_the_operator_confirms(
     console = Console(file=shown, width=200)
     if answer == "n":
         with pytest.raises(InputError, match="not resumed and not changed"):
-            resume(session, console, ["z-up"], asks=True)
+            resume(session, console, ["z-up"], "en", asks=True)
         assert len(session.entries) == before
     else:
-        resume(session, console, ["z-up"], asks=True)
+        resume(session, console, ["z-up"], "en", asks=True)
         assert events(session)[before:] == ["redone", "resumed"]
     assert "of unit nominal: accepted steps: z-up" in shown.getvalue()
     assert "resume it? [y/n]" in shown.getvalue()
