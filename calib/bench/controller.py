@@ -25,6 +25,7 @@ from typing import Final
 import numpy as np
 
 from calib.bench.completion import (
+    accepted_result,
     activate,
     ask_operator,
     decide_alone,
@@ -57,9 +58,6 @@ REDRAW_S: Final = 0.2
 """Interval at which the screen is redrawn and keys are read, s."""
 
 
-ABORT: Final = message("ask_abort")
-
-
 class SessionController:
     """Worker that conducts a session to its end, or as far as possible.
 
@@ -76,7 +74,9 @@ class SessionController:
     screen, keys
         The operator's terminal.
     hands_free : bool
-        No keys are expected.
+        The steps need no keys.
+    accepts : bool
+        The result is accepted without a person, unless a verdict is bad.
     begin : callable
         Called with the procedure of the steps to do, before their samples are read; a rehearsal starts its
         unit then.
@@ -87,6 +87,8 @@ class SessionController:
         Error that ended the work.
     outcome : tuple of Message
         Summary for the operator; empty if the session is not at its end.
+    is_undecided : bool
+        The result waits for a person to accept or reject it.
     """
 
     def __init__(
@@ -99,17 +101,19 @@ class SessionController:
         keys: Keyboard,
         *,
         hands_free: bool,
+        accepts: bool,
         begin: Callable[[Procedure], None],
     ) -> None:
         self.error: BaseException | None = None
         self.outcome: tuple[Message, ...] = ()
+        self.is_undecided = False
         self._session, self._layout, self._service = session, layout, service
         self._procedure = procedure = session.procedure()
         self._steps = {step.id: step for step in (*procedure.steps, *verification(procedure).steps)}
         self._sink, self._screen, self._keys = queue, screen, keys
         self._queue = QueueReader(queue, lambda text: session.append(ServiceMessage(text)))
         self._recordings = AttemptRecordings(session, service, self._queue)
-        self._hands_free, self._begin = hands_free, begin
+        self._hands_free, self._accepts, self._begin = hands_free, accepts, begin
         self._is_unit_detected = False
         self._conditions = Conditions()
         self._conditions_ns = 0
@@ -141,33 +145,40 @@ class SessionController:
         result = session_result(session)
         if self._sink.is_closed:
             raise ServiceEndedError  # nothing is decided after Ctrl-C
-        if not self._is_accepted(result):
+        decision = self._decision(result)
+        if decision is None:
+            self.is_undecided = True
+            self._screen.say(message("undecided"))
+            return
+        if not decision.accepted:
             path = str(session.plan.certificate.path)
             self.outcome = (message("result_rejected", path=path),)
             return
         activate(session, result.certificate)
+        if REPORT not in session.files:
+            write_report(session, result)
+        for line in accepted_result(session):
+            self._screen.say(line)
         last = self._run_steps(verification(self._procedure))
         if isinstance(last, Aborted):
             return
         residual = None
         if VERIFICATION in last.accepted:
             residual = residual_velocity(session, result.certificate)
-        write_report(session, result, residual)
-        session.end(SessionEnded(residual))
         verified = message("verification_skipped") if residual is None else residual.message
-        self.outcome = (
-            message("active_certificate", path=str(session.plan.certificate.path)),
-            message("verification", result=verified),
-            message("report", path=str(session.folder / REPORT)),
-        )
+        write_report(session, result, verified)
+        session.end(SessionEnded(residual))
+        self.outcome = (*accepted_result(session), message("verification", result=verified))
 
-    def _is_accepted(self, result: Result) -> bool:
-        """Return the decision in the journal, or take it now."""
+    def _decision(self, result: Result) -> Decision | None:
+        """Return the decision in the journal, or take it now; None: nobody is there."""
         decision = self._session.stage(Decision)
         if decision is None:
             summarise(result, self._screen)
-            if self._hands_free:
+            if self._accepts:
                 decision = Decision(decide_alone(result))
+            elif not self._keys.there:
+                return None
             else:
                 unit = self._session.plan.unit
                 decision = Decision(ask_operator(unit, self._screen, self._keys, self._queue))
@@ -175,7 +186,7 @@ class SessionController:
                 self._session.append(decision)
         if not decision.accepted:
             self._session.end(decision)
-        return decision.accepted
+        return decision
 
     def _run_steps(self, procedure: Procedure) -> Finished | Aborted:
         """Conduct the steps that are not accepted yet; on return all recordings are filed."""
@@ -206,7 +217,7 @@ class SessionController:
                 if events or is_due:
                     shown_s = time.monotonic()
                     view = with_port_state(engine.view, self._service.port_state)
-                    self._screen.show(view, ABORT if self._keys.asks else None)
+                    self._screen.show(view, self._keys.question)
         except ServiceEndedError:
             self._recordings.record_closed()
             raise

@@ -1,6 +1,6 @@
 """Conditions for resuming a session, and the operator's consent."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -9,7 +9,7 @@ from rich.console import Console
 
 from calib.bench.entries import EmbeddedFile, Resumed
 from calib.bench.session import Session
-from calib.bench.state import RESULT
+from calib.bench.state import REPORT, RESULT
 from calib.bench.verify import faulty_files
 from calib.messages import Message, message, text
 from imudrv import profiles
@@ -22,7 +22,7 @@ RESUME_KELVIN: Final = 5.0
 
 def check_files(session: Session) -> None:
     """Raise `InputError` if a file of the session is missing or damaged."""
-    if faults := faulty_files(session):
+    if faults := faulty_files(session, session.files.keys() - {REPORT}):  # the report is written anew
         raise InputError("\n  ".join([f"{session.folder}: cannot be resumed:", *faults]))
 
 
@@ -114,7 +114,9 @@ def require_temperature(session: Session, degc: Mapping[str, float | None]) -> N
             )
 
 
-def resume(session: Session, console: Console, redo: Sequence[str], language: str, *, asks: bool) -> None:
+def resume(
+    session: Session, console: Console, redo: Sequence[str], language: str, ask: Callable[[], bool] | None
+) -> None:
     """Report the progress of a session, ask whether to resume it, and withdraw the steps to be done again.
 
     Parameters
@@ -127,8 +129,8 @@ def resume(session: Session, console: Console, redo: Sequence[str], language: st
         Steps to be done again.
     language : str
         Language of the operator.
-    asks : bool
-        The operator is asked; otherwise the session is resumed at once.
+    ask : callable or None
+        Waits for the operator's answer; None: the session is resumed at once.
 
     Raises
     ------
@@ -140,8 +142,11 @@ def resume(session: Session, console: Console, redo: Sequence[str], language: st
     port = message("resume_port", port=plan.port, certificate=str(plan.certificate.path))
     lines += [text(state, language), text(port, language)]
     console.print("\n".join(lines), markup=False, soft_wrap=True)
-    question = text(message("resume"), language)
-    if asks and console.input(question, markup=False).strip().lower() not in ("y", "yes"):
-        raise InputError(f"{session.folder}: not resumed and not changed; name another folder to begin anew")
+    if ask is not None:
+        console.print(text(message("resume"), language), markup=False)
+        if not ask():
+            raise InputError(
+                f"{session.folder}: not resumed and not changed; name another folder to begin anew"
+            )
     session.redo(redo)
     session.append(Resumed(session.record_leftovers()))

@@ -12,6 +12,7 @@ from typing import Final
 
 from rich.console import Console
 
+from calib.bench.completion import accepted_result
 from calib.bench.controller import SessionController
 from calib.bench.entries import EmbeddedFile
 from calib.bench.keys import Keyboard
@@ -41,7 +42,7 @@ from imudrv.service.settings import Settings
 from imudrv.signals import SIGHUP
 from imudrv.sinks.history import History
 from imudrv.site import Site
-from imudrv.terminal import INTERRUPTED, OK
+from imudrv.terminal import INTERRUPTED, NOT_GOOD, OK
 from imudrv.units import MM
 
 PROCEDURE: Final = "three-rotations"
@@ -73,6 +74,8 @@ class RunOptions:
         Name or path; None: `PROCEDURE`.
     hands_free : bool
         Proceed by the sensors alone, without keys.
+    accept : bool
+        Accept the result without a person, unless a verdict is bad.
     rehearse : bool
         Use a simulated unit and technician, hands free.
     speed : str
@@ -92,6 +95,7 @@ class RunOptions:
     site: Path | None = None
     procedure: str | None = None
     hands_free: bool = False
+    accept: bool = False
     rehearse: bool = False
     speed: str = "1"
     redo: Sequence[str] = ()
@@ -131,7 +135,8 @@ def run(options: RunOptions, console: Console) -> int:
     Returns
     -------
     int
-        Exit code: 0 at the session's end, 130 when it can be resumed.
+        Exit code: 0 at the session's end; 130 when it can be resumed; 3 when nobody was there to accept the
+        result.
 
     Raises
     ------
@@ -154,7 +159,9 @@ def open_or_create(options: RunOptions, console: Console) -> Session:
     session = Session.open(options.folder)
     try:
         _require_resumable(session, options)
-        resume(session, console, options.redo, language(options.language), asks=options.has_operator)
+        resume(
+            session, console, options.redo, language(options.language), _ask if options.has_operator else None
+        )
     except BaseException:
         session.close()
         raise
@@ -197,6 +204,7 @@ def conduct(session: Session, options: RunOptions, console: Console) -> int:
         OperatorScreen(console, language(options.language)),
         Keyboard(),
         hands_free=not options.has_operator,
+        accepts=options.accept or (options.is_rehearsal and not options.has_operator),
         begin=begin,
     )
     worker = Thread(target=controller.run, name="controller")
@@ -211,12 +219,14 @@ def conduct(session: Session, options: RunOptions, console: Console) -> int:
             if simulated is not None:
                 simulated.end()
             if not controller.outcome:
+                for line in accepted_result(session):
+                    options.say(console, line)
                 options.say(console, message("accepted_steps", steps=steps_message(session)))
                 options.say(console, message("resume_with", folder=str(session.folder)))
     if controller.error is not None:
         raise controller.error
     if not controller.outcome:
-        return INTERRUPTED
+        return NOT_GOOD if controller.is_undecided else INTERRUPTED
     for line in controller.outcome:
         options.say(console, line)
     if simulated is not None:
@@ -225,6 +235,11 @@ def conduct(session: Session, options: RunOptions, console: Console) -> int:
         against = comparison(found, simulated.truth(layout), "the simulated unit")
         console.print(as_text(against), markup=False, highlight=False, soft_wrap=True)
     return OK
+
+
+def _ask() -> bool:
+    with Keyboard() as keys:
+        return keys.wait_for_answer()
 
 
 def _check(options: RunOptions, exists: bool) -> None:

@@ -17,7 +17,7 @@ from rich.text import Text
 
 from calib.bench import block_letters
 from calib.bench.keys import BY_LINES
-from calib.messages import Message, english, message, text
+from calib.messages import Message, message, text
 from calib.procedure.events import Phase, View
 from imudrv.diagnosis import LineState
 
@@ -37,6 +37,10 @@ _OTHER_ROWS: Final = 8
 """Rows besides headline, hints and reasons; one stays free for terminals that scroll after the last row."""
 
 
+_FIGURES: Final = 5
+"""Rows of the bars."""
+
+
 _FEWEST: Final = 2
 
 
@@ -51,6 +55,7 @@ _NAMES: Final = {
     "confirm": ("Enter", message("key_confirm")),
     "redo": ("r", message("key_redo")),
     "skip": ("s", message("key_skip")),
+    "back": ("b", message("key_back")),
     "abort": ("q", message("key_abort")),
 }
 """Key and name of each action."""
@@ -153,19 +158,21 @@ def screen(
     top = Table.grid(expand=True)
     top.add_column(no_wrap=True, overflow="ellipsis")
     top.add_column(justify="right", no_wrap=True)
-    where = f"{shown(PHASES[view.phase]).upper()} {_time(view.remaining_s)}"
-    top.add_row(Text(shown(view.title), "bold"), Text(where, "bold"))
+    top.add_row(Text(shown(view.title), "bold"), Text(shown(PHASES[view.phase]).upper(), "bold"))
     headline = () if language == "en" else (view.headline,)
     hints = _wrapped([*map(shown, (*headline, *view.hints))], width, _FEWEST, _MOST_HINTS)
-    reasons = _wrapped([*map(shown, view.reasons)], width, _FEWEST, _MOST_REASONS)
+    reasons = _wrapped([*map(shown, _reasons(view))], width, _FEWEST, _MOST_REASONS)
+    last_try = _wrapped([shown(tried) for tried in _last_try(view)], width, 0, 1)
     last = _keys(view.actions, language) if question is None else shown(question)
-    free = height - _OTHER_ROWS - len(hints) - len(reasons)
+    figures = () if _is_rejected(view) else (_figures(view, width, ascii_only, language),)
+    free = height - _OTHER_ROWS + _FIGURES * (not figures) - len(hints) - len(reasons) - len(last_try)
     return Group(
         top,
         _banner(view, width, max(1, free), ascii_only),
         Text("\n".join(hints)),
-        _figures(view, width, ascii_only, language),
+        *figures,
         Text("\n".join(reasons), "bold red"),
+        *(Text(row, "dim") for row in last_try),
         Text(last, "dim" if question is None else "bold red", no_wrap=True, overflow="crop"),
     )
 
@@ -177,7 +184,8 @@ def plain(view: View, question: Message | None = None, language: str = "en") -> 
         return text(what, language)
 
     phase = f"{shown(PHASES[view.phase])}: {shown(view.headline)}"
-    parts = [shown(view.title), phase, *map(shown, view.hints), *(f"! {shown(why)}" for why in view.reasons)]
+    parts = [shown(view.title), phase, *map(shown, view.hints)]
+    parts += [f"! {shown(why)}" for why in _reasons(view)] + [shown(tried) for tried in _last_try(view)]
     parts += [] if question is None else [f"! {shown(question)}"]
     return " | ".join(part for part in parts if part)
 
@@ -294,18 +302,37 @@ class OperatorScreen:
             self._live = None
 
 
-def _time(seconds: float | None) -> str:
-    return "" if seconds is None else f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
+def large_text(view: View, language: str = "en") -> str:
+    """Return the headline, with the remaining time where one has to wait."""
+    headline, remaining_s = text(view.headline, language), view.remaining_s
+    if view.headline.key != "hands_off" or remaining_s is None:
+        return headline
+    return f"{headline} {int(remaining_s) // 60}:{int(remaining_s) % 60:02d}"
+
+
+def _is_rejected(view: View) -> bool:
+    """Whether the view shows a rejected attempt."""
+    return view.headline.key == "rejected"
+
+
+def _reasons(view: View) -> tuple[Message, ...]:
+    """Return the reasons to show: of a rejection one, which its hint remedies."""
+    return view.reasons[:1] if _is_rejected(view) else view.reasons
+
+
+def _last_try(view: View) -> tuple[Message, ...]:
+    """Return why the last attempt was rejected."""
+    return tuple(message("label_last_try", reason=reason) for reason in view.last_try[:1])
 
 
 def _banner(view: View, width: int, height: int, ascii_only: bool) -> RenderableType:
-    refused = view.reasons and view.phase in (Phase.PREFLIGHT, Phase.PLACE, Phase.VERDICT)
+    refused = view.reasons and view.phase in (Phase.PREFLIGHT, Phase.VERDICT)
     style = (
         "white on red"
         if refused or view.headline in (NO_DATA, NO_FRAMES, WRONG_RATE)
         else _STYLES[view.phase]
     )
-    headline, inside = english(view.headline), width - 2
+    headline, inside = large_text(view), width - 2
     scale, lines = block_letters.fitted(headline, inside, height)
     if ascii_only and scale < 2:
         scale = 0
