@@ -9,7 +9,8 @@ from calib.bench.session import Session
 from calib.bench.state import REPORT, RESULT
 from calib.certificate import write
 from calib.lever_arms.gauge import convert
-from calib.reports.identification import arms_text, report_html, verdict
+from calib.reports.identification import arms_text, report_html
+from calib.reports.verdict import verdict
 from imudrv.calibration import Calibration, read_calibration, write_calibration
 from imudrv.errors import InputError
 from imudrv.files import atomic

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Final
 
 from calib.axes import opposite
-from calib.detection.noise import Noise
+from calib.estimation.noise import SensorNoise
 from calib.estimation.predict import PlannedRotation, Prediction, predict
 from calib.procedure.schema import VERIFICATION, Pose, Procedure, Step
 from imudrv.errors import InputError
@@ -21,10 +21,8 @@ TURN_S: Final = 2.5
 """Duration of a rotation by hand from rest to rest, for predictions, s."""
 
 
-TYPICAL_NOISE: Final = Noise(
-    angle_walk=0.002 * DEG_PER_SQRT_H, velocity_walk=8e-5, velocity_white=6e-5, velocity_pulse=1.2e-4
-)
-"""Noise of a unit that was not measured yet; the beat of its pulses makes it quieter in some poses."""
+TYPICAL_NOISE: Final = SensorNoise(0.002 * DEG_PER_SQRT_H, velocity_walk=5e-5, degrees_of_freedom=0)
+"""Noise of a unit that was not measured yet."""
 
 
 def predicted(procedure: Procedure, site: Site, skipped: Collection[str] = ()) -> Prediction:

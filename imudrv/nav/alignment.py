@@ -55,7 +55,7 @@ from imudrv.nav.earth import EARTH_RATE, earth_rate_n
 from imudrv.nav.mechanisation import body_step
 from imudrv.nav.noise import fit_noise_model
 from imudrv.records import Records
-from imudrv.units import DEG, NS, NS_PER_S
+from imudrv.units import DEG, DEG_PER_H, NS, NS_PER_S
 from imudrv.vectors import Vector, add, put, vector_at
 
 ALIGNMENT_S: Final = 370.0
@@ -71,6 +71,11 @@ BLOCK_NS: Final = 100_000_000
 """Samples are summed over blocks of this length, ns."""
 _BLOCKS_A_SECOND: Final = NS_PER_S // BLOCK_NS
 _ROUNDS: Final = 5
+
+LEAST_VERTICAL: Final = 5.0 * DEG_PER_H
+"""Deviation of the Earth's vertical rate that is never taken for the other hemisphere, rad/s."""
+PARTS: Final = 8
+"""Parts of a window whose means show how well the whole mean is known."""
 
 WINDOW_BLOCKS: Final = 50
 """Length of the intervals that are compared to detect motion, blocks."""
@@ -139,6 +144,16 @@ class Aligned:
         """Azimuth of the body's Y axis, from north to east, rad."""
         C_nb = rows_of(quaternion_at(self.q_nb))
         return atan2(C_nb[0][1], C_nb[1][1])
+
+
+class RestReadings(NamedTuple):
+    """Mean readings at rest that do not depend on the attitude, and the 1-sigma noise of the means."""
+
+    force: float  # m/s^2
+    force_sigma: float
+    rate_up: float  # along the specific force, rad/s
+    rate_level: float  # across it
+    rate_sigma: float
 
 
 class Alignment:
@@ -222,6 +237,24 @@ class Alignment:
         if used:
             self._last = (int(increments["counter"][used - 1]), int(increments["t_ns"][used - 1]))
         return increments[used:]
+
+    def readings(self) -> RestReadings:
+        """Return the mean readings of what was fed, to be compared with those of the site."""
+        blocks = self._blocks[: self._state[0]["filled"]]
+        size = len(blocks) // PARTS
+        parts = _summed(blocks[: size * PARTS], size)
+        f_b, omega_b = (parts[name] / parts["dt"][:, None] for name in ("dv_b", "dtheta_b"))
+        up = f_b.mean(axis=0) / np.linalg.norm(f_b.mean(axis=0))
+        force, rate_up = f_b @ up, omega_b @ up
+        level = omega_b.mean(axis=0) - rate_up.mean() * up
+        force_sigma, rate_sigma = (float(x.std(ddof=1)) / sqrt(PARTS) for x in (force, rate_up))
+        return RestReadings(
+            float(np.linalg.norm(f_b.mean(axis=0))),
+            force_sigma,
+            float(rate_up.mean()),
+            float(np.linalg.norm(level)),
+            rate_sigma,
+        )
 
     def result(self) -> Aligned:
         """Attitude at the end of what was fed, even before the window is full.
@@ -357,6 +390,14 @@ def _coarse(blocks: Records, latitude_rad: float) -> Array:
         raise InputError(
             f"alignment: expected the horizontal part of the Earth's rotation, {expected:.4g} rad/s at this "
             f"latitude, as the mean rate, got {horizontal:.4g} rad/s; check the gyros' calibration and that "
+            "the unit is at rest"
+        )
+    vertical, of_site = float(rate @ up), earth_rate_n(latitude_rad)[2]
+    if abs(vertical - of_site) > max(abs(of_site), LEAST_VERTICAL):
+        raise InputError(
+            "alignment: expected the vertical part of the Earth's rotation, "
+            f"{of_site / DEG_PER_H:+.2f} deg/h at this latitude, in the mean rate, got "
+            f"{vertical / DEG_PER_H:+.2f} deg/h; check the sign of the latitude, the gyros' signs, and that "
             "the unit is at rest"
         )
     east /= horizontal
