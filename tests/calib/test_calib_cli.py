@@ -218,8 +218,13 @@ def test_a_certificate_that_the_data_contradict_is_refused_but_the_report_is_the
     monkeypatch.setattr("calib.estimation.result.SCATTER_LIMIT", 1e-3)
     assert identify(*CAPTURES, "-o", "bad.yaml", "--json", "bad.json", "--report", "bad.html") == 2
     printed = capsys.readouterr()
-    assert re.search(r"^  bad +The velocities contradict the model", printed.out, re.MULTILINE)
-    assert "no certificate: the velocities contradict the model: expected chi-square" in printed.err
+    assert re.search(
+        r"^  bad +The velocities within the rests contradict the noise", printed.out, re.MULTILINE
+    )
+    assert (
+        "no certificate: the velocities within the rests contradict the noise of the alignments"
+        in printed.err
+    )
     assert not (here / "bad.yaml").exists()
     assert (here / "bad.json").exists()
     assert (here / "bad.html").exists()
