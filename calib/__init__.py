@@ -18,6 +18,7 @@ Data flow; every module can be read alone::
     estimation      rotations aligned and navigated; lever arms from their velocities; accuracy of a plan
     lever_arms      gauges, and the formats of other programs
     identification  captures to an identification result
+    alignment       a rest of a capture to level and heading, compared with the site
     result_file     the result as JSON      certificate  the result as a calibration file
 
     procedure       the bench procedure as data, and its state machine
@@ -35,6 +36,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from calib.alignment import align as align
     from calib.api import load_procedure as load_procedure
     from calib.api import predict as predict
     from calib.api import validate as validate
@@ -50,6 +52,7 @@ _MODULES = {
     "LeverArms": "calib.lever_arms.gauge",
     "PlannedRotation": "calib.estimation.predict",
     "Session": "calib.bench.session",
+    "align": "calib.alignment",
     "identify": "calib.identification",
     "load_procedure": "calib.api",
     "predict": "calib.api",

@@ -23,6 +23,7 @@ from calib.procedure.events import (
     Rejected,
     Restarted,
     Skipped,
+    Turned,
 )
 from imudrv.errors import InputError
 from imudrv.units import MM
@@ -176,7 +177,7 @@ class LineDropped:
 
 
 Counted: TypeAlias = (
-    Entered | Checked | Restarted | Rejected | Skipped | Redone | Finished | Aborted | UnitDetected
+    Entered | Checked | Restarted | Turned | Rejected | Skipped | Redone | Finished | Aborted | UnitDetected
 )
 """Entries with the counter of the newest sample."""
 

@@ -207,7 +207,7 @@ def _navigate(
         decoded.layout,
         calibration,
         site,
-        attempt.recording.stem,
+        attempt.step.id,
         NavigationOptions(limits, expected=attempt.step.up[1]),
     )
     if len(navigated.runs) != 1:

@@ -21,10 +21,14 @@ from calib.bench.resume import check_files, require_same, resume
 from calib.bench.screen import OperatorScreen
 from calib.bench.session import Session
 from calib.bench.simulated_unit import SimulatedUnitProcess, is_rehearsal
-from calib.bench.state import JOURNAL, REPORT, WORKING_CERTIFICATE
+from calib.bench.state import JOURNAL, REPORT, RESULT, WORKING_CERTIFICATE
+from calib.bench.technician import BENCH
+from calib.certificate import lever_arms_of
 from calib.inputs import require_six_axes
-from calib.procedure.plan import load_file, predicted
+from calib.procedure import plan
 from calib.procedure.schema import Procedure
+from calib.reports.text import as_text
+from calib.reports.truth import comparison
 from imudrv import profiles
 from imudrv.calibration import coefficients, read_calibration
 from imudrv.errors import InputError
@@ -73,6 +77,8 @@ class RunOptions:
         Speed of the rehearsal: a number, or ``max``.
     redo : sequence of str
         Steps of an existing session to do again.
+    plan : bool
+        Only show the procedure and its expected accuracy.
     """
 
     folder: Path
@@ -85,6 +91,7 @@ class RunOptions:
     rehearse: bool = False
     speed: str = "1"
     redo: Sequence[str] = ()
+    plan: bool = False
 
     @property
     def is_rehearsal(self) -> bool:
@@ -103,7 +110,7 @@ def new_folder() -> Path:
 
 
 def run(options: RunOptions, console: Console) -> int:
-    """Conduct a new or an existing session.
+    """Conduct a new or an existing session, or show what a new one would be.
 
     Parameters
     ----------
@@ -122,6 +129,9 @@ def run(options: RunOptions, console: Console) -> int:
     InputError
         An option is invalid, or the session cannot be resumed; the message says why.
     """
+    if options.plan:
+        console.print(_plan_text(options), markup=False, highlight=False, soft_wrap=True)
+        return OK
     with closing(open_or_create(options, console)) as session:
         return conduct(session, options, console)
 
@@ -144,15 +154,15 @@ def open_or_create(options: RunOptions, console: Console) -> Session:
 
 def conduct(session: Session, options: RunOptions, console: Console) -> int:
     """Conduct an open session: the service runs in this thread, the controller in another; see `run`."""
-    plan = session.plan
+    begun_with = session.plan
     simulated = SimulatedUnitProcess(session.folder, options.speed) if options.is_rehearsal else None
     queue = QueueSink(QUEUE_LIMIT if simulated is not None and simulated.waits else None)
-    layout = profiles.load(plan.profile.name).layout()
+    layout = profiles.load(begun_with.profile.name).layout()
     settings = Settings(
-        port=options.port or plan.port,
-        profile=plan.profile.name,
+        port=options.port or begun_with.port,
+        profile=begun_with.profile.name,
         calibration=str(session.folder / WORKING_CERTIFICATE),
-        unit=plan.unit,
+        unit=begun_with.unit,
         status=str(Path(tempfile.gettempdir()) / f"imu50-calib-{os.getpid()}.sock"),
     )
     signals = SignalFlags()
@@ -167,7 +177,7 @@ def conduct(session: Session, options: RunOptions, console: Console) -> int:
 
     def begin(steps: Procedure) -> None:
         if simulated is not None:
-            simulated.begin(steps, plan.profile.name)
+            simulated.begin(steps, begun_with.profile.name)
 
     controller = SessionController(
         session,
@@ -199,6 +209,11 @@ def conduct(session: Session, options: RunOptions, console: Console) -> int:
     if not controller.outcome:
         return INTERRUPTED
     console.print(controller.outcome, markup=False, highlight=False, soft_wrap=True)
+    if simulated is not None:
+        result = session.folder / RESULT
+        found = lever_arms_of(read_calibration(result), str(result))
+        against = comparison(found, simulated.truth(layout), "the simulated unit")
+        console.print(as_text(against), markup=False, highlight=False, soft_wrap=True)
     return OK
 
 
@@ -215,10 +230,18 @@ def _check(options: RunOptions, exists: bool) -> None:
         raise InputError(f"--redo: expected an existing session, with --session, got none in {folder}")
 
 
+def _plan_text(options: RunOptions) -> str:
+    """Return the plan of a new session."""
+    if options.site is None and not options.rehearse:
+        raise InputError("--plan: expected --site, for the latitude, or --rehearse")
+    site = BENCH if options.site is None else settings_file.read(options.site, Site)
+    return plan.text(plan.load(options.procedure or PROCEDURE), site)
+
+
 def _create(options: RunOptions, console: Console) -> Session:
     """Create a session, and print the expected accuracy of its procedure."""
     folder, name = options.folder, options.procedure or PROCEDURE
-    procedure = load_file(name)
+    procedure = plan.load_file(name)
     port, calibration, site, profile = options.port, options.calibration, options.site, options.profile
     if options.is_rehearsal:
         profile = profile or REHEARSAL_PROFILE
@@ -232,8 +255,12 @@ def _create(options: RunOptions, console: Console) -> Session:
         raise incomplete
     require_sensors(coefficients(read_calibration(calibration)), layout)
     place = settings_file.read_file(site, Site)
-    worst_mm = float(predicted(procedure.model, place.model).differences_sigma.max()) / MM
-    expected = f"session {folder}: expected accuracy of the differences: {worst_mm:.3f} mm (1 sigma)"
+    worst_mm = float(plan.predicted(procedure.model, place.model).differences_sigma.max()) / MM
+    minutes = plan.duration_s(procedure.model) / 60.0
+    expected = (
+        f"session {folder}: about {minutes:.0f} min, expected accuracy of the differences: "
+        f"{worst_mm:.3f} mm (1 sigma)"
+    )
     console.print(expected, markup=False, soft_wrap=True)
     return Session.create(
         folder,
@@ -253,7 +280,7 @@ def _require_resumable(session: Session, options: RunOptions) -> None:
     procedure, site = options.procedure, options.site
     require_same(
         session,
-        procedure=EmbeddedFile.of(procedure, load_file(procedure).content) if procedure else None,
+        procedure=EmbeddedFile.of(procedure, plan.load_file(procedure).content) if procedure else None,
         calibration=options.calibration,
         site=EmbeddedFile.of(site, settings_file.read_file(site, Site).content) if site else None,
         profile=options.profile or session.plan.profile.name,

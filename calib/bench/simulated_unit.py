@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Final
 
 from calib.bench.technician import BENCH, technician_scenario, true_calibration
+from calib.certificate import lever_arms_of
+from calib.lever_arms.gauge import LeverArms
 from calib.procedure.schema import Procedure
 from imudrv import profiles
 from imudrv.calibration import write_calibration
@@ -86,6 +88,10 @@ class SimulatedUnitProcess:
         write_calibration(certificate, unit.model_copy(update={"size_effect": None}))
         settings_file.write(site, BENCH)
         return str(self._link), certificate, site
+
+    def truth(self, layout: Layout) -> LeverArms:
+        """Return the true lever arms of the unit, to compare the result with at the end."""
+        return lever_arms_of(true_calibration(SEED, nominal(layout)), "the simulated unit")
 
     def begin(self, procedure: Procedure, profile: str) -> None:
         """Start the unit anew and carry out a procedure with it.

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation as Attitude
 
 from calib.axes import side
 from calib.certificate import sensing_points
-from calib.procedure.plan import TURN_S
+from calib.procedure.plan import turn_s
 from calib.procedure.preflight import PREFLIGHT_S
 from calib.procedure.prompts import READY_S
 from calib.procedure.schema import Procedure, Step
@@ -41,7 +41,7 @@ from imudrv.sim.scenario import (
 )
 from imudrv.site import Site
 
-Kind = Literal["moves", "wrong way", "short", "slow", "wrong pose", "bump", "unplug"]
+Kind = Literal["moves", "wrong way", "short", "slow", "wrong pose", "bump", "unplug", "short rest"]
 
 
 BENCH: Final = Site(latitude_deg=28.2, longitude_deg=113.0, height_m=60.0)
@@ -50,6 +50,10 @@ BENCH: Final = Site(latitude_deg=28.2, longitude_deg=113.0, height_m=60.0)
 
 REACTION_S: Final = 4.0
 """Time from the engine's instruction to the action, s."""
+
+
+TURN_REACTION_S: Final = 1.0
+"""The same before the second and later turns of a run, s."""
 
 
 CARRY_DEG_PER_S: Final = 45.0
@@ -72,11 +76,14 @@ class Mistake:
         'moves': touches the unit during the alignment. 'wrong way': rotates in the wrong direction first.
         'short': rotates by 150 deg only. 'slow': takes 8 s. 'wrong pose': puts another side up first. 'bump':
         bumps the bench during the rest after the rotation. 'unplug': unplugs the cable for 3 s during the
-        alignment.
+        alignment. 'short rest': rotates again too early; in a step of several turns.
+    turn : int
+        Number of the turn, in a step of several.
     """
 
     step_id: str
     kind: Kind
+    turn: int = 1
 
 
 def technician_scenario(
@@ -94,7 +101,7 @@ def technician_scenario(
     procedure : Procedure
         The procedure.
     mistakes : sequence of Mistake
-        At most one per step; the step is repeated after it.
+        At most one per step. The step is repeated after it; one of several turns is not.
     seed : int
         Random seed of the unit's errors, its lever arms, and the technician's hands.
     calibration : Calibration, optional
@@ -112,9 +119,9 @@ def technician_scenario(
     InputError
         A mistake in a step that does not exist, or two in one step.
     """
-    kinds = {mistake.step_id: mistake.kind for mistake in mistakes}
+    by_step = {mistake.step_id: mistake for mistake in mistakes}
     known = [step.id for step in procedure.steps]
-    if len(kinds) != len(mistakes) or not kinds.keys() <= set(known):
+    if len(by_step) != len(mistakes) or not by_step.keys() <= set(known):
         raise InputError(
             f"rehearsal: expected mistakes in different steps of {', '.join(known)}, "
             f"got {', '.join(m.step_id for m in mistakes)}"
@@ -123,7 +130,7 @@ def technician_scenario(
     truth = _draw_lever_arms(rng, unit) if calibration is None else calibration
     hands = _MotionScript(procedure, rng)
     for step in procedure.steps:
-        hands.do(step, kinds.get(step.id))
+        hands.do(step, by_step.get(step.id))
     hands.rest(REACTION_S)
     return Scenario(
         format="imu50-scenario",
@@ -176,11 +183,10 @@ class _MotionScript:
             self._carry(first)
         self.rest(PREFLIGHT_S + REACTION_S)
 
-    def do(self, step: Step, mistake: Kind | None) -> None:
-        """Carry out a step."""
-        turn_s = TURN_S * self._rng.uniform(0.9, 1.1)
-        turn_deg = step.turn_deg + self._rng.uniform(-1.5, 1.5)
-        sign = np.sign(step.turn_deg)
+    def do(self, step: Step, made: Mistake | None) -> None:
+        """Carry out a step, with a mistake."""
+        turn_deg, turn_s = self._by_hand(step.turn_deg)
+        mistake = made.kind if made else None
         if mistake == "wrong pose":
             self._carry(self._wrong_pose(step))
             self.rest(2.0 * REACTION_S)
@@ -194,14 +200,9 @@ class _MotionScript:
             self.rest(before_s + 0.5 * step.align_s)
             self.unplugs.append(Unplug(at_s=self._t_s, duration_s=3.0))
             self.rest(3.0)
-        elif mistake is not None and mistake != "wrong pose":
+        elif mistake is not None and mistake != "wrong pose" and step.turns == 1:
             self._align(step)
-            first_deg, first_s = {
-                "wrong way": (-40.0 * sign, 1.0),
-                "short": (150.0 * sign, turn_s),
-                "slow": (180.0 * sign, 8.0),
-                "bump": (turn_deg, turn_s),
-            }[mistake]
+            first_deg, first_s = _mistaken(mistake, turn_deg, turn_s)
             self._turn(first_deg, first_s)
             self.rest(REACTION_S)
             if mistake == "bump":
@@ -209,8 +210,31 @@ class _MotionScript:
                 self.rest(REACTION_S)
             self._turn(-first_deg, 4.0)
         self._align(step)
+        if step.turns > 1:
+            self._several_turns(step, made)
+            return
         self._turn(turn_deg, turn_s)
         self.rest(step.rest_s + REACTION_S)
+
+    def _several_turns(self, step: Step, made: Mistake | None) -> None:
+        """Make the turns of a run, without repeating the one with the mistake."""
+        for number in range(1, step.turns + 1):
+            turn_deg, turn_s = self._by_hand(step.angle_deg(number))
+            mistake = made.kind if made and made.turn == number else None
+            self._turn(*_mistaken(mistake, turn_deg, turn_s))
+            if mistake == "short rest":
+                self.rest(0.5 * step.rest_s)
+                continue
+            if mistake == "bump":
+                self.rest(0.5 * step.rest_s)
+                self._turn(0.5, 0.2)
+            self.rest(step.rest_s + TURN_REACTION_S)
+        self.rest(REACTION_S)
+
+    def _by_hand(self, turn_deg: float) -> tuple[float, float]:
+        """Return angle and duration of a turn as a hand makes it."""
+        duration_s = turn_s(self._procedure) * self._rng.uniform(0.9, 1.1)
+        return turn_deg + self._rng.uniform(-1.5, 1.5), duration_s
 
     def rest(self, duration_s: float) -> None:
         """Leave the unit alone."""
@@ -270,6 +294,13 @@ class _MotionScript:
         """Return whether the unit is in the pose of a step."""
         off = Attitude.from_matrix(self._C_nb @ step.C_bn)
         return bool(off.magnitude() < radians(20.0))
+
+
+def _mistaken(mistake: Kind | None, turn_deg: float, turn_s: float) -> tuple[float, float]:
+    """Return angle and duration of a turn with a mistake."""
+    sign = float(np.sign(turn_deg))
+    turns = {"wrong way": (-40.0 * sign, 1.0), "short": (150.0 * sign, turn_s), "slow": (180.0 * sign, 8.0)}
+    return turns.get(mistake or "", (turn_deg, turn_s))
 
 
 def _start(step: Step, C_nb: Array) -> Start:

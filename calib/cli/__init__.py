@@ -12,6 +12,7 @@ COMMANDS: Final = {
     "run": "Run the bench procedure with a unit: from the first pose to its new certificate.",
     "verify": "Check the files of a session, and compute its result again from the recordings.",
     "identify": "Identify lever arms from captures of rotations: certificate and report.",
+    "align": "Align a rest: level, heading, and its readings against the site; exit code 3 if it moved.",
     "validate": "Navigate the same pulses with and without compensation; exit code 3 if a verdict is bad.",
     "gauge": "Convert the lever arms of a certificate to another gauge, exactly, with their covariance.",
     "export-arms": "Print the lever arms of a certificate in the format of another program.",

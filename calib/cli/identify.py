@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Final, get_args
 
-from calib.certificate import certificate, check_target, write
+from calib.certificate import certificate, check_target, lever_arms_of, write
 from calib.cli.arguments import (
     add_certificate_output,
     add_channel,
@@ -19,7 +19,9 @@ from calib.identification import EstimationOptions, identify, prior_calibration
 from calib.lever_arms.gauge import Gauge, LeverArms, convert
 from calib.reports.identification import document, report_html
 from calib.reports.text import print_document
+from calib.reports.truth import comparison
 from calib.result_file import result_document, write_json
+from imudrv.calibration import read_calibration
 from imudrv.cli.arguments import add_profile
 from imudrv.errors import InputError
 from imudrv.files.atomic import atomic_write
@@ -73,12 +75,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_certificate_output(parser)
     add("--json", type=Path, metavar="R.json", help="the whole result as JSON")
     add("--report", type=Path, metavar="R.html", help="report with figures, one file")
+    text = "true unit of a simulation: the result is compared with it at the end, and does not depend on it"
+    add("--truth", type=Path, metavar="T.yaml", help=text)
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Identify the lever arms from captures."""
     point = known_point(arguments.at)
-    inputs = (*arguments.captures, arguments.profile, arguments.calibration, arguments.site)
+    inputs = (*arguments.captures, arguments.profile, arguments.calibration, arguments.site, arguments.truth)
     for output in filter(None, (arguments.output, arguments.json, arguments.report)):
         check_output(output, *inputs)
     prior = prior_calibration(arguments.captures, arguments.calibration, arguments.unit)
@@ -119,6 +123,9 @@ def run(arguments: argparse.Namespace) -> None:
     finally:
         print_document(document(result, gauges))
         print(*written, sep="\n")
+    if arguments.truth is not None:
+        true = lever_arms_of(read_calibration(arguments.truth), str(arguments.truth))
+        print_document(comparison(arms, true, arguments.truth.name))
 
 
 def _sigma(text: str) -> float:

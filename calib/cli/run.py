@@ -29,6 +29,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--session", dest="folder", type=Path, default=new_folder(), metavar="DIR", help=text)
     text = "repeat this step of an existing session; may be given several times"
     add("--redo", action="append", default=[], metavar="STEP", help=text)
+    add(
+        "--plan",
+        action="store_true",
+        help="only show the steps, how long they take, and the expected accuracy",
+    )
     add("--hands-free", action="store_true", help="continue by the sensors alone, without keys")
     add("--rehearse", action="store_true", help="use a simulated unit and technician")
     add("--speed", default="1", metavar="X", help="speed of the rehearsal: 1, 10, ... or max")

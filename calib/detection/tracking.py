@@ -178,18 +178,18 @@ class RotationTracker:
         self.rate = 0.0  # about the vertical, rad/s
         self.peak = 0.0  # rad/s
         self._total = (0.0, 0.0, 0.0)
-        self._up_before = self._up = up_b
+        self._up_before = self.up_b = up_b
 
     def feed(self, block: Block) -> None:
         """Process a block."""
         if self.begun is None:
             self.begun = block.last
-        about_up = dot(block.dtheta, self._up)
+        about_up = dot(block.dtheta, self.up_b)
         self.angle += about_up
         self.rate = about_up / block.seconds
         self.peak = max(self.peak, hypot(*block.dtheta) / block.seconds)
         self._total = add(self._total, block.dtheta)
-        self._up = turn(conjugate(quaternion_of_vector(block.dtheta)), self._up)
+        self.up_b = turn(conjugate(quaternion_of_vector(block.dtheta)), self.up_b)
 
     @property
     def size(self) -> float:

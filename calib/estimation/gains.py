@@ -47,7 +47,8 @@ def gain_rows(run: Run, k: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 def rest_growth(run: Run) -> Array:
     """Return the rate at which H grows in the rest before the first turn, (3, 9), 1/s; in theory zero."""
     at = run.arrests[0]
-    return np.asarray(run.rows["H"][at][-1] / run.t_s[at][-1], np.float64)
+    t_s = run.t_s[at]
+    return np.asarray(np.einsum("n,nij->ij", t_s, run.rows["H"][at]) / (t_s @ t_s), np.float64)
 
 
 def singular_values_of(gains: Sequence[tuple[Array, Array]]) -> Array:

@@ -49,7 +49,7 @@ class Priors:
     accelerometer_bias: float = 100.0 * UG
     accelerometer_scale: float = 50.0 * PPM
     accelerometer_misalignment: float = 100.0 * URAD
-    gyro_bias: float = 0.02 * DEG_PER_H
+    gyro_bias: float = 0.01 * DEG_PER_H
     gyro_scale: float = 10.0 * PPM
     gyro_misalignment: float = 100.0 * URAD
     accelerometer_bias_of_run: float = 30.0 * UG

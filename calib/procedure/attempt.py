@@ -1,6 +1,6 @@
 """One attempt at a step: increments in, navigation log out."""
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,13 @@ from imudrv.vectors import Vector
 _BLOCKS_PER_PASS: Final = 500
 
 
+class JudgedTurn(NamedTuple):
+    """A rotation that has ended."""
+
+    begun: int | None  # counter of a sample in it
+    is_within_limits: bool
+
+
 class Attempt:
     """Samples of one attempt, from the first sample at rest.
 
@@ -28,7 +35,11 @@ class Attempt:
     heading_rad : float
         Clockwise deviation of the pose from its heading, at the end of the alignment.
     turn : RotationTracker
-        Rotation since the start of navigation.
+        Current rotation.
+    number : int
+        Its number, from 1.
+    turns : list of JudgedTurn
+        The rotations that have ended.
     samples : int
         Number of samples so far.
     """
@@ -37,6 +48,8 @@ class Attempt:
         self.aligned: Aligned | None = None
         self.heading_rad = 0.0
         self.turn = RotationTracker()
+        self.number = 1
+        self.turns: list[JudgedTurn] = []
         self.samples = 0
         self._first = self._last = -1  # counters
         self._waiting: list[Records] = []
@@ -85,9 +98,16 @@ class Attempt:
         result = navigator.feed(rows)
         self._navigated.append((result["counter"].copy(), result["v_n"].copy(), result["H"].copy()))
 
-    def rotation(self) -> Rotation | None:
-        """Return the rotation that was detected in the blocks processed so far."""
-        begun = self.turn.begun
+    def next_turn(self, turns: int) -> None:
+        """Start to track another rotation of a run of `turns`."""
+        self.turn, self.number = RotationTracker(self.turn.up_b), min(len(self.turns) + 1, turns)
+
+    def judge(self, is_within_limits: bool) -> None:
+        """Count the current rotation, which has ended."""
+        self.turns.append(JudgedTurn(self.turn.begun, is_within_limits))
+
+    def rotation(self, begun: int | None) -> Rotation | None:
+        """Return the rotation that was detected in the blocks processed so far, and contains a counter."""
         rotations = self._segmenter.result().rotations
         return next((r for r in rotations if begun is not None and r.stop > begun), None)
 

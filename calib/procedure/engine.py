@@ -12,11 +12,15 @@ who cuts these from a recording gets the same.
 
 Velocity and H of every sample from the end of an alignment to the end of the rest after the rotation are in
 the `NavigationLog` of the run.
+
+A step with several turns is one run: after each turn and its rest the next one is due, without a new
+alignment. A turn outside its limits and a rest cut short are reported, and the run continues. Lost, saturated
+or faulted samples end it, and so does a unit that leaves its pose. At least half of the turns have to be
+within their limits.
 """
 
 from collections.abc import Mapping
 
-from calib.axes import side
 from calib.detection.blocks import Block, BlockSplitter
 from calib.detection.tracking import MG, AttitudeTracker, StillnessDetector
 from calib.messages import message, verbatim
@@ -40,6 +44,7 @@ from calib.procedure.events import (
 from calib.procedure.phases import STATES, motion_limits
 from calib.procedure.plan import predicted
 from calib.procedure.progress import Progress
+from calib.procedure.prompts import title
 from calib.procedure.schema import Procedure
 from calib.procedure.transitions import NEW_ATTEMPT, TRANSITIONS, Outcome
 from imudrv.calibration import Calibration
@@ -167,12 +172,12 @@ class Engine:
         return View(
             phase=self._phase,
             step_id=step.id,
-            title=message("title", step=p.index + 1, steps=steps, side=side(step.up), turn_deg=step.turn_deg),
+            title=title(step, p.index + 1, steps, p.attempt.number),
             headline=headline,
             hints=hints,
             reasons=p.reasons,
             angle_deg=rotation.angle / DEG if state.turning else None,
-            want_deg=float(step.turn_deg) if state.turning else None,
+            want_deg=float(p.turn_deg) if state.turning else None,
             rate_deg_per_s=(rotation.rate if state.turning else p.stillness.rate) / DEG,
             stillness=p.stillness.stillness,
             progress=None if duration_s is None else min(1.0, p.elapsed_s / duration_s),

@@ -119,15 +119,40 @@ class Restarted:
 
 
 @dataclass(frozen=True)
+class Turned:
+    """One of several rotations of a run has ended.
+
+    Attributes
+    ----------
+    turn : int
+        Its number, from 1.
+    angle_deg, duration_s, peak_deg_per_s, axis_tilt_deg : float
+        The rotation.
+    reasons : tuple of Message
+        What was wrong with it; the run continues.
+    """
+
+    step_id: str
+    attempt: int
+    turn: int
+    angle_deg: float
+    duration_s: float
+    peak_deg_per_s: float
+    axis_tilt_deg: float
+    reasons: tuple[Message, ...]
+    counter: int
+
+
+@dataclass(frozen=True)
 class Accepted:
-    """A rotation is accepted.
+    """A run is accepted.
 
     Attributes
     ----------
     first_counter, last_counter : int
         First and last sample of the attempt: rest before, rotation, rest after, and nothing else.
     angle_deg, duration_s, peak_deg_per_s, axis_tilt_deg : float
-        The rotation, as detected in these samples.
+        The rotation, as detected in these samples; the last one of several.
     rest_before_s, rest_after_s : float
         Lengths of the rests before and after it.
     level_sigma_deg, heading_sigma_deg : float
@@ -139,6 +164,8 @@ class Accepted:
     samples : int or None
         Number of samples of the attempt, fewer than the counters span where some were lost; None in the
         journal of an older version.
+    turns, turns_within_limits : int
+        Number of rotations of the run, and of those within their limits.
     """
 
     step_id: str
@@ -156,6 +183,8 @@ class Accepted:
     heading_deg: float
     v_n: tuple[float, float, float]
     samples: int | None = None
+    turns: int = 1
+    turns_within_limits: int = 1
 
 
 @dataclass(frozen=True)
@@ -216,7 +245,9 @@ class Aborted:
     counter: int
 
 
-Event: TypeAlias = Entered | Checked | Restarted | Accepted | Rejected | Skipped | Redone | Finished | Aborted
+Event: TypeAlias = (
+    Entered | Checked | Restarted | Turned | Accepted | Rejected | Skipped | Redone | Finished | Aborted
+)
 
 
 @dataclass(frozen=True)
@@ -260,7 +291,7 @@ class View:
     step_id : str
         Id of the step.
     title : Message
-        Title of the step: ``step 2 of 3: X up, +180 deg``.
+        Title of the step: ``step 2 of 3: X up, +180 deg``, or ``step 2 of 3: X up, turn 4 of 10``.
     headline : Message
         What to do now; at most 38 characters in English.
     hints : tuple of Message

@@ -6,6 +6,7 @@ from typing import Final
 
 import numpy as np
 
+from calib.axes import side
 from calib.detection.acceptance import rejection_reasons
 from calib.detection.blocks import BLOCK_NS, Block
 from calib.detection.segments import LEAST_FORCE, QUIET_S, SIGMAS, Rotation
@@ -16,7 +17,7 @@ from calib.estimation.runs import GUARD_S
 from calib.messages import Message, message, verbatim
 from calib.procedure import prompts
 from calib.procedure.attempt import Attempt
-from calib.procedure.events import PREFLIGHT, Accepted, Checked, Phase, Rejected
+from calib.procedure.events import PREFLIGHT, Accepted, Checked, Phase, Rejected, Turned
 from calib.procedure.preflight import PREFLIGHT_S, axis_faults, sensor_faults
 from calib.procedure.progress import Progress
 from calib.procedure.prompts import MIN_ROTATION_RAD, READY_S, Prompt
@@ -233,13 +234,14 @@ class Aligning(PhaseState):
 
 
 class Rotating(PhaseState):
-    """The rotation: waits for it, however long it takes, then for its end."""
+    """A rotation: waits for it, then for its end; however long the first one of a step takes."""
 
     turning = True
 
     def prompt(self) -> Prompt:
         """Return what the operator has to do."""
-        return prompts.rotate(self.progress.observation, self.progress.attempt.turn)
+        p = self.progress
+        return prompts.rotate(p.observation, p.attempt.turn, p.turn_deg, p.procedure.turn_s)
 
     def feed(self, block: Block) -> Outcome | None:
         """Follow the rotation."""
@@ -251,30 +253,73 @@ class Rotating(PhaseState):
             if trouble:
                 return p.restart(message("before_rotation", cause=trouble))
             if not p.stillness.moving:
-                self._wait()
-                return None
+                return self._wait()
         elif trouble:
             return p.reject(message("during_rotation", cause=trouble))
         rotation.feed(block)
         if p.stillness.quiet_s < QUIET_S + _MARGIN_S:
             return None
         if rotation.size < MIN_ROTATION_RAD:
-            return p.restart(message("rest_disturbed", angle_deg=rotation.size / DEG))
+            disturbed = message("rest_disturbed", angle_deg=rotation.size / DEG)
+            if not attempt.turns:
+                return p.restart(disturbed)
+            p.tell(disturbed)
+            return Outcome.TURNED  # the rest has to be repeated
         attempt.process()
-        reasons = _rejections(p, attempt.rotation(), rest_after_s=0.0)
-        return p.reject(*reasons) if reasons else Outcome.TURNED
+        if p.step.turns > 1:
+            return self._judge(attempt.rotation(rotation.begun))
+        if reasons := _rejections(p, attempt.rotation(rotation.begun), rest_after_s=0.0):
+            return p.reject(*reasons)
+        attempt.judge(True)
+        return Outcome.TURNED
 
-    def _wait(self) -> None:
+    def _wait(self) -> Outcome | None:
         """Keep the log short."""
         p = self.progress
+        if p.attempt.turns:
+            # a rest as long as an alignment would begin another run in the recording
+            if p.stillness.quiet_s < min(WAIT_S, 0.9 * p.step.align_s):
+                return None
+            return p.restart(message("paused", elapsed_s=p.stillness.quiet_s))
         if p.elapsed_s >= WAIT_S and p.attitude.q_nb is not None:
             p.attempt.process()
             p.navigate(p.attitude.q_nb)
             p.elapsed_s = 0.0
+        return None
+
+    def _judge(self, rotation: Rotation | None) -> Outcome:
+        """Judge one of several turns: the run continues if it can be navigated through."""
+        p, attempt = self.progress, self.progress.attempt
+        if rotation is None:
+            return p.reject(message("no_rotation"))
+        limits = replace(p.procedure.rotation_limits(p.step), rest_before_s=0.0, rest_after_s=0.0)
+        reasons = rejection_reasons(rotation, limits, p.step.up[1])
+        if rotation.missing > limits.missing or rotation.flags & (Flag.SATURATED | Flag.FAULT):
+            return p.reject(*reasons)
+        if not p.observation.upright:
+            return p.reject(message("left_pose", side=side(p.step.up)), *reasons)
+        attempt.judge(not reasons)
+        if _is_wrong_way(rotation, p.turn_deg):
+            reasons = (prompts.wrong_direction(rotation.angle_deg, p.turn_deg), *reasons)
+        p.tell(*reasons)
+        p.events.append(
+            Turned(
+                step_id=p.step.id,
+                attempt=p.number,
+                turn=len(attempt.turns),
+                angle_deg=rotation.angle_deg,
+                duration_s=rotation.duration_s,
+                peak_deg_per_s=rotation.peak_deg_per_s,
+                axis_tilt_deg=rotation.axis_tilt_deg,
+                reasons=reasons,
+                counter=p.counter,
+            )
+        )
+        return Outcome.TURNED
 
 
 class Resting(PhaseState):
-    """The rest after the rotation."""
+    """The rest after a rotation."""
 
     turning = True
 
@@ -287,17 +332,32 @@ class Resting(PhaseState):
         return Prompt(message("resting"), (message("do_not_touch"),))
 
     def feed(self, block: Block) -> Outcome | None:
-        """Judge the rotation after the rest."""
+        """Judge the rotation after the rest, or ask for the next one."""
         p, attempt = self.progress, self.progress.attempt
         attempt.append(block)
         if cause := p.disturbance(block):
             rest_s = p.step.rest_s
-            return p.reject(message("rest_interrupted", elapsed_s=p.elapsed_s, rest_s=rest_s, cause=cause))
+            interrupted = message("rest_interrupted", elapsed_s=p.elapsed_s, rest_s=rest_s, cause=cause)
+            if p.step.turns == 1 or p.trouble(block):
+                return p.reject(interrupted)
+            p.tell(interrupted)
+            attempt.next_turn(p.step.turns)
+            attempt.turn.feed(block)
+            return Outcome.NEXT_TURN
         if p.stillness.quiet_s < p.step.rest_s + _MARGIN_S:
             return None
+        if len(attempt.turns) < p.step.turns:
+            attempt.next_turn(p.step.turns)
+            p.bells += 1
+            return Outcome.NEXT_TURN
         attempt.process()
-        rotation = attempt.rotation()
-        reasons = _rejections(p, rotation, p.step.rest_s)
+        return self._judge()
+
+    def _judge(self) -> Outcome:
+        """Accept or reject the attempt."""
+        p, attempt = self.progress, self.progress.attempt
+        rotation = attempt.rotation(attempt.turns[-1].begun)
+        reasons = self._reasons(rotation)
         accepted = None if reasons or rotation is None else self._accepted(rotation)
         if accepted is None:
             return p.reject(*reasons)
@@ -305,6 +365,18 @@ class Resting(PhaseState):
         p.events.append(accepted)
         p.bells += 1
         return Outcome.ACCEPTED
+
+    def _reasons(self, rotation: Rotation | None) -> tuple[Message, ...]:
+        """Return why the run cannot be used; `rotation` is the last one."""
+        p, turns = self.progress, self.progress.attempt.turns
+        if p.step.turns == 1:
+            return _rejections(p, rotation, p.step.rest_s)
+        if rotation is None:
+            return (message("no_rotation"),)
+        within = sum(turn.is_within_limits for turn in turns)
+        if 2 * within >= len(turns):
+            return ()
+        return (message("too_few_turns", within=within, turns=len(turns)),)
 
     def _accepted(self, rotation: Rotation) -> Accepted | None:
         """Summarise an accepted rotation and keep its log; None: it lacks a rest or an alignment."""
@@ -332,6 +404,8 @@ class Resting(PhaseState):
             heading_deg=attempt.heading_rad / DEG,
             v_n=(east, north, up),
             samples=attempt.samples,
+            turns=len(attempt.turns),
+            turns_within_limits=sum(turn.is_within_limits for turn in attempt.turns),
         )
 
 
@@ -401,6 +475,10 @@ def _rejections(progress: Progress, rotation: Rotation | None, rest_after_s: flo
         return (message("no_rotation"),)
     limits = replace(progress.procedure.rotation_limits(step), rest_after_s=rest_after_s)
     reasons = rejection_reasons(rotation, limits, step.up[1])
-    if rotation.angle_deg * np.sign(step.turn_deg) < -MIN_ROTATION_RAD / DEG:
-        return (prompts.wrong_direction(rotation.angle_deg, step), *reasons)
+    if _is_wrong_way(rotation, step.turn_deg):
+        return (prompts.wrong_direction(rotation.angle_deg, step.turn_deg), *reasons)
     return reasons
+
+
+def _is_wrong_way(rotation: Rotation, turn_deg: int) -> bool:
+    return bool(rotation.angle_deg * np.sign(turn_deg) < -MIN_ROTATION_RAD / DEG)

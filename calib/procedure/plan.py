@@ -5,24 +5,29 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from calib.axes import opposite
+from calib.axes import opposite, side
 from calib.estimation.noise import SensorNoise
 from calib.estimation.predict import PlannedRotation, Prediction, predict
+from calib.procedure.preflight import PREFLIGHT_S
 from calib.procedure.schema import VERIFICATION, Pose, Procedure, Step
 from imudrv.errors import InputError
 from imudrv.files import shipped as shipped_files
 from imudrv.files.settings_file import SettingsFile, read_file
 from imudrv.site import Site
-from imudrv.units import DEG_PER_SQRT_H
+from imudrv.units import DEG_PER_SQRT_H, MM
 
 _FOLDER: Final = Path(__file__).parents[1] / "procedures"
 
-TURN_S: Final = 2.5
-"""Duration of a rotation by hand from rest to rest, for predictions, s."""
-
-
 TYPICAL_NOISE: Final = SensorNoise(0.002 * DEG_PER_SQRT_H, velocity_walk=5e-5, degrees_of_freedom=0)
 """Noise of a unit that was not measured yet."""
+
+
+HANDLING_S: Final = 15.0
+"""Time to carry the unit into a pose, for the duration of a procedure, s."""
+
+
+REACTION_S: Final = 1.0
+"""Time until a rotation begins that is due, for the duration of a procedure, s."""
 
 
 def predicted(procedure: Procedure, site: Site, skipped: Collection[str] = ()) -> Prediction:
@@ -48,7 +53,14 @@ def predicted(procedure: Procedure, site: Site, skipped: Collection[str] = ()) -
         The six differences are not observable from these rotations; names the directions.
     """
     plan = [
-        PlannedRotation(step.up, step.turn_deg, TURN_S, step.rest_s)
+        PlannedRotation(
+            step.up,
+            step.turn_deg,
+            turn_s(procedure),
+            step.rest_s,
+            turns=step.turns,
+            alternate=step.alternate,
+        )
         for step in procedure.steps
         if step.id not in skipped
     ]
@@ -56,6 +68,40 @@ def predicted(procedure: Procedure, site: Site, skipped: Collection[str] = ()) -
         return predict(plan, site.latitude_rad, TYPICAL_NOISE)
     except InputError as error:
         raise InputError(f"procedure {procedure.name}: {error}") from error
+
+
+def turn_s(procedure: Procedure) -> float:
+    """Return the duration of a rotation by hand from rest to rest, s."""
+    shortest, longest = procedure.turn_s
+    return 0.5 * (shortest + longest)
+
+
+def duration_s(procedure: Procedure) -> float:
+    """Return how long a procedure takes in practised hands, s."""
+    return PREFLIGHT_S + sum(
+        HANDLING_S
+        + procedure.limits.still_s
+        + step.align_s
+        + step.turns * (REACTION_S + turn_s(procedure) + step.rest_s)
+        for step in procedure.steps
+    )
+
+
+def text(procedure: Procedure, site: Site) -> str:
+    """Return a plan as text: its steps, how long it takes, and its predicted accuracy; see `predicted`."""
+    prediction = predicted(procedure, site)
+    shortest, longest = procedure.turn_s
+    rotations = sum(step.turns for step in procedure.steps)
+    lines = [f"{procedure.name}: {rotations} rotations, about {duration_s(procedure) / 60.0:.0f} min"]
+    lines += [
+        f"  {step.id}: {side(step.up)} up, {side(step.east)} east; alignment of {step.align_s:g} s, then "
+        f"{step.turns} x 180 deg in {shortest:g} to {longest:g} s with a rest of {step.rest_s:g} s"
+        for step in procedure.steps
+    ]
+    lines.append("expected accuracy (1 sigma), mm       X       Y       Z")
+    for name, sigma in zip(("r_x - r_y", "r_x - r_z"), prediction.differences_sigma / MM, strict=True):
+        lines.append(f"  {name:30}" + "".join(f"{value:8.4f}" for value in sigma))
+    return "\n".join(lines)
 
 
 def steps_left(procedure: Procedure, done: Collection[str]) -> Procedure:
@@ -78,7 +124,8 @@ def steps_left(procedure: Procedure, done: Collection[str]) -> Procedure:
 def verification(procedure: Procedure) -> Procedure:
     """Return a procedure of one more rotation, `VERIFICATION`, from the pose in which the last one ended."""
     last = procedure.steps[-1]
-    return _with_steps(procedure, [replace(last, id=VERIFICATION, east=opposite(last.east))])
+    east = opposite(last.east) if last.turns % 2 else last.east
+    return _with_steps(procedure, [replace(last, id=VERIFICATION, east=east, turns=1)])
 
 
 def _with_steps(procedure: Procedure, steps: Sequence[Step]) -> Procedure:

@@ -84,6 +84,11 @@ class Progress:
         return self.attempts.get(self.step.id, 0)
 
     @property
+    def turn_deg(self) -> int:
+        """Required angle of the current rotation."""
+        return self.step.angle_deg(self.attempt.number)
+
+    @property
     def observation(self) -> StepObservation:
         """Sensors against the current step."""
         return StepObservation(
@@ -118,6 +123,11 @@ class Progress:
         """Start the navigation log of the attempt at rest, with this attitude."""
         navigator = Navigator(self.site.place, q_nb, C_ba=self.calibration.accelerometer.C_ba)
         self.attempt.navigate(navigator, turn(conjugate(q_nb), (0.0, 0.0, 1.0)))
+
+    def tell(self, *reasons: Message) -> None:
+        """Show the operator what was wrong; the run continues."""
+        self.bells += bool(reasons)
+        self.reasons = reasons
 
     def restart(self, *reasons: Message) -> Outcome:
         """Report that the alignment has to start again."""

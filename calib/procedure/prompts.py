@@ -120,9 +120,17 @@ def pose_message(step: Step) -> Message:
     return message("pose", up=side(step.up), east=side(step.east), north=side(north))
 
 
-def wrong_direction(angle_deg: float, step: Step) -> Message:
+def title(step: Step, number: int, steps: int, turn: int) -> Message:
+    """Return the title of step `number` of `steps`, at one of its turns."""
+    up = side(step.up)
+    if step.turns > 1:
+        return message("title_turns", step=number, steps=steps, side=up, turn=turn, turns=step.turns)
+    return message("title", step=number, steps=steps, side=up, turn_deg=step.turn_deg)
+
+
+def wrong_direction(angle_deg: float, expected_deg: int) -> Message:
     """Return the message of a rotation with the wrong sign."""
-    return message("wrong_direction", angle_deg=angle_deg, expected_deg=step.turn_deg)
+    return message("wrong_direction", angle_deg=angle_deg, expected_deg=expected_deg)
 
 
 def lean_message(lean_rad: float, step: Step, limits: ProcedureLimits) -> Message:
@@ -163,40 +171,48 @@ def settle(observed: StepObservation) -> Prompt:
     return Prompt(message("settling"), _motion(observed))
 
 
-def rotate(observed: StepObservation, rotation: RotationTracker) -> Prompt:
-    """Prompt for the rotation."""
-    step, limits = observed.step, observed.limits
-    whole, angle_deg = abs(step.turn_deg) * DEG, rotation.angle / DEG
-    instruction = message("rotation", turn=turn_message(step.turn_deg * DEG))
+def rotate(
+    observed: StepObservation, rotation: RotationTracker, turn_deg: int, turn_s: tuple[float, float]
+) -> Prompt:
+    """Prompt for a rotation by `turn_deg`, in `turn_s` from the shortest to the longest time."""
+    limits = observed.limits
+    whole, angle_deg = abs(turn_deg) * DEG, rotation.angle / DEG
+    shortest_s, longest_s = turn_s
+    instruction = message(
+        "rotation", turn=turn_message(turn_deg * DEG), shortest_s=shortest_s, longest_s=longest_s
+    )
     if rotation.begun is None:
-        return Prompt(message("rotate_now", turn_deg=step.turn_deg), (instruction,))
+        return Prompt(message("rotate_now", turn_deg=turn_deg), (instruction,))
     if rotation.size > MIN_ROTATION_RAD:
         if rotation.axis_tilt > limits.axis_tilt_deg * DEG:
             return Prompt(message("wrong_axis"), (_off_axis(observed, rotation),))
-        if rotation.angle * step.turn_deg < 0.0:
-            return Prompt(message("wrong_way"), (wrong_direction(angle_deg, step),))
+        if rotation.angle * turn_deg < 0.0:
+            return Prompt(message("wrong_way"), (wrong_direction(angle_deg, turn_deg),))
     done = abs(rotation.angle)
     if done + abs(rotation.rate) * _REACTION_S >= whole:
-        return Prompt(message("stop"), (message("stop_at", angle_deg=abs(step.turn_deg)),))
+        return Prompt(message("stop"), (message("stop_at", angle_deg=abs(turn_deg)),))
     if done >= whole - limits.angle_tolerance_deg * DEG:
         return Prompt(message("hold_still"), (message("turned", angle_deg=angle_deg),))
     # a smooth rotation is nearly at its fastest from a quarter of the way on
     peak, least = rotation.peak / DEG, limits.least_peak_deg_per_s
     if 0.25 < done / whole < 0.7 and peak < 0.9 * least:
         return Prompt(message("faster"), (message("slow", peak_deg_per_s=peak, limit_deg_per_s=least),))
-    return Prompt(message("rotate", turn_deg=step.turn_deg), (instruction,))
+    return Prompt(message("rotate", turn_deg=turn_deg), (instruction,))
 
 
 def verdict(step: Step, number: int, steps: int, accepted: Accepted | None) -> Prompt:
     """Verdict on an attempt; None: it was rejected."""
     if accepted is None:
         return Prompt(message("rejected"), (pose_message(step),))
-    hint = message(
-        "accepted",
-        angle_deg=accepted.angle_deg,
-        duration_s=accepted.duration_s,
-        peak_deg_per_s=accepted.peak_deg_per_s,
-    )
+    if accepted.turns > 1:
+        hint = message("accepted_turns", turns=accepted.turns, within=accepted.turns_within_limits)
+    else:
+        hint = message(
+            "accepted",
+            angle_deg=accepted.angle_deg,
+            duration_s=accepted.duration_s,
+            peak_deg_per_s=accepted.peak_deg_per_s,
+        )
     return Prompt(message("step_done", step=number, steps=steps), (hint,))
 
 

@@ -1,7 +1,8 @@
 """Schema of a procedure file: poses, rotations, rests and limits.
 
-A file lists poses; `Procedure.steps` are its rotations in order, a pose with `repeats` gives several. The id
-of a step never changes, so that a journal, a key and a recording can name it.
+A file lists poses; `Procedure.steps` are its runs in order, each with one alignment. A pose with `repeats`
+gives several; one with `turns` gives one run of several rotations with a rest, the *arrest*, after each. The
+id of a step never changes, so that a journal, a key and a recording can name it.
 `calib.procedure.plan.predicted` gives the accuracy of a plan in advance, and refuses one from which the six
 differences are not observable.
 """
@@ -19,6 +20,10 @@ from calib.detection import acceptance
 from imudrv.arrays import Array
 from imudrv.files.model import Model
 from imudrv.nav.alignment import MAX_ALIGNMENT_S, MIN_ALIGNMENT_S
+
+LEAST_ARREST_S: Final = 1.0
+"""Shortest rest that counts as one between two turns, s."""
+
 
 VERIFICATION: Final = "verification"
 """Step id of the rotation that verifies the result."""
@@ -43,12 +48,16 @@ class ProcedureLimits(Model):
     axis_tilt_deg: Annotated[float, Key(gt=0, le=20)] = 10.0
 
 
+TurnTime = Annotated[float, Key(ge=0.5, le=60)]
+
+
 class Pose(Model):
-    """A pose and the rotation in it: `up` points up and `east` about east, before the rotation.
+    """A pose and the rotations in it: `up` points up and `east` about east, before the first rotation.
 
     `turn_deg` is right-handed about the vertical: +180 is counter-clockwise, seen from above. Each
-    rotation reverses the heading, so that a repeat begins where the rotation before it ended. `align_s` and
-    `rest_s` are those of the procedure where they are absent.
+    rotation reverses the heading, so that a repeat begins where the rotation before it ended. `turns`: number
+    of rotations after one alignment, `alternate`: every second one is back. `align_s` and `rest_s` are those
+    of the procedure where they are absent.
     """
 
     id: Annotated[str, Key(pattern=r"^[a-z0-9]+(-[a-z0-9]+)*$", max_length=40)]
@@ -58,6 +67,17 @@ class Pose(Model):
     align_s: Annotated[float, Key(ge=MIN_ALIGNMENT_S, le=MAX_ALIGNMENT_S)] | None = None
     rest_s: Annotated[float, Key(ge=2, le=600)] | None = None
     repeats: Annotated[int, Key(ge=1, le=20)] = 1
+    turns: Annotated[int, Key(ge=1, le=20)] = 1
+    alternate: bool = True
+
+    @model_validator(mode="after")
+    def _turns_or_repeats(self) -> Self:
+        if self.turns > 1 and self.repeats > 1:
+            raise ValueError(
+                f"expected turns or repeats above 1, got turns: {self.turns} and repeats: {self.repeats}; "
+                "write several poses"
+            )
+        return self
 
     @model_validator(mode="after")
     def _two_axes(self) -> Self:
@@ -70,18 +90,22 @@ class Pose(Model):
 
 @dataclass(frozen=True)
 class Step:
-    """One rotation of the procedure.
+    """One run of the procedure: an alignment, and one or more rotations.
 
     Attributes
     ----------
     id : str
         Id of the pose; with repeats ``ID-1``, ``ID-2``, ...
     up, east : str
-        Body axes that point up and about east before the rotation.
+        Body axes that point up and about east before the first rotation.
     turn_deg : int
-        +180 or -180, right-handed about up.
+        The first rotation: +180 or -180, right-handed about up.
     align_s, rest_s : float
-        Length of the alignment, and of the rest after the rotation.
+        Length of the alignment, and of the rest after each rotation.
+    turns : int
+        Number of rotations.
+    alternate : bool
+        Whether every second rotation is back.
     """
 
     id: str
@@ -90,6 +114,12 @@ class Step:
     turn_deg: int
     align_s: float
     rest_s: float
+    turns: int = 1
+    alternate: bool = True
+
+    def angle_deg(self, turn: int) -> int:
+        """Return the angle of a turn, numbered from 1: +180 or -180, right-handed about up."""
+        return -self.turn_deg if self.alternate and turn % 2 == 0 else self.turn_deg
 
     @property
     def C_bn(self) -> Array:
@@ -99,15 +129,41 @@ class Step:
 
 
 class Procedure(Model):
-    """A procedure file."""
+    """A procedure file.
+
+    `kind`: what it determines; those of the sensors and of the noise are not run yet. `turn_s`: shortest and
+    longest duration of a rotation from rest to rest, for the operator and for the predicted accuracy.
+    """
 
     format: Literal["imu50-procedure"]
-    version: Literal[1]
+    version: Literal[1, 2]
     name: Annotated[str, Key(min_length=1, max_length=80)]
+    kind: Literal["arms"] = "arms"
     align_s: Annotated[float, Key(ge=MIN_ALIGNMENT_S, le=MAX_ALIGNMENT_S)] = 370.0
     rest_s: Annotated[float, Key(ge=2, le=600)] = 15.0
+    turn_s: tuple[TurnTime, TurnTime] = (2.0, 3.0)
     limits: ProcedureLimits = ProcedureLimits()
     poses: Annotated[tuple[Pose, ...], Key(min_length=1, max_length=100)]
+
+    @classmethod
+    def advice_for_value(cls, path: str, value: object) -> str:
+        """Return why another kind of procedure is refused."""
+        known = path == "kind" and value in ("sensors", "noise")
+        return f"this version does not run procedures of kind {value}" if known else ""
+
+    @model_validator(mode="after")
+    def _keys_of_the_version(self) -> Self:
+        given = self.model_fields_set.union(*(pose.model_fields_set for pose in self.poses))
+        newer = sorted(given & {"kind", "turn_s", "turns", "alternate"})
+        if self.version == 1 and newer:
+            raise ValueError(f"expected no {', '.join(newer)} in version 1, got one; write version: 2")
+        return self
+
+    @model_validator(mode="after")
+    def _shorter_first(self) -> Self:
+        if self.turn_s[0] > self.turn_s[1]:
+            raise ValueError(f"turn_s: expected the shorter duration first, got {list(self.turn_s)}")
+        return self
 
     @model_validator(mode="after")
     def _each_id_once(self) -> Self:
@@ -118,7 +174,7 @@ class Procedure(Model):
 
     @property
     def steps(self) -> tuple[Step, ...]:
-        """Rotations in order."""
+        """Runs in order."""
         return tuple(
             Step(
                 pose.id if pose.repeats == 1 else f"{pose.id}-{k + 1}",
@@ -127,13 +183,17 @@ class Procedure(Model):
                 pose.turn_deg,
                 pose.align_s or self.align_s,
                 pose.rest_s or self.rest_s,
+                pose.turns,
+                pose.alternate,
             )
             for pose in self.poses
             for k in range(pose.repeats)
         )
 
     def rotation_limits(self, step: Step) -> acceptance.RotationLimits:
-        """Return the limits of the rotation of a step, for `rejection_reasons` and `navigate_rotations`.
+        """Return the limits of the rotations of a step, for `rejection_reasons` and `navigate_rotations`.
+
+        An arrest between turns counts even if it was cut short.
 
         Parameters
         ----------
@@ -151,5 +211,5 @@ class Procedure(Model):
             least_peak_deg_per_s=limits.least_peak_deg_per_s,
             axis_tilt_deg=limits.axis_tilt_deg,
             rest_before_s=step.align_s,
-            rest_after_s=step.rest_s,
+            rest_after_s=step.rest_s if step.turns == 1 else LEAST_ARREST_S,
         )

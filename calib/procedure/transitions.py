@@ -1,6 +1,7 @@
 """Transition table of the procedure.
 
     PREFLIGHT -> PLACE -> SETTLE -> ALIGN -> ROTATE -> REST -> VERDICT -> PLACE (next step, or again) ... DONE
+                                             ROTATE <- REST  (next turn)
 
 Every change of phase is a row of `TRANSITIONS`. An outcome without a row is ignored in that phase. The first
 phase is PREFLIGHT, or DONE where an earlier session has accepted every step.
@@ -21,7 +22,8 @@ class Outcome(Enum):
     SETTLED = auto()  # at rest for long enough
     DISTURBED = auto()  # the alignment has to start again
     ALIGNED = auto()
-    TURNED = auto()  # the rotation has ended within its limits
+    TURNED = auto()  # the rotation has ended; the only one of a step within its limits
+    NEXT_TURN = auto()  # another rotation is due, or has begun early
     ACCEPTED = auto()
     REJECTED = auto()  # by its limits, or because its recording is not complete
     AGAIN = auto()  # another attempt, after a rejection or on request
@@ -44,6 +46,7 @@ TRANSITIONS: Final[dict[tuple[Phase, Outcome], Phase]] = {
     (Phase.ALIGN, Outcome.ALIGNED): Phase.ROTATE,
     (Phase.ROTATE, Outcome.DISTURBED): Phase.SETTLE,
     (Phase.ROTATE, Outcome.TURNED): Phase.REST,
+    (Phase.REST, Outcome.NEXT_TURN): Phase.ROTATE,
     (Phase.REST, Outcome.ACCEPTED): Phase.VERDICT,
     **{(phase, Outcome.REJECTED): Phase.VERDICT for phase in IN_A_STEP},
     **{(phase, Outcome.AGAIN): Phase.PLACE for phase in IN_A_STEP},

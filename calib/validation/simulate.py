@@ -8,7 +8,7 @@ becomes the calibration of the trial. The truth is never used there.
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -20,15 +20,14 @@ from calib.estimation.runs import NavigationOptions, Run, navigate_capture
 from calib.validation.navigate import navigate
 from calib.validation.trial import RATE_FILTER, Trial, TrialSettings
 from imudrv import profiles
-from imudrv.arrays import Array
-from imudrv.calibration import Accelerometer, Calibration, Gyro
+from imudrv.calibration import Calibration
 from imudrv.imu.rate_filter import RateFilterName
 from imudrv.nav.alignment import ALIGNMENT_S
 from imudrv.records import Flag, Records
 from imudrv.sim import scenario as scenarios
+from imudrv.sim import truth
 from imudrv.sim.scenario import NOMINAL, Residuals, Rest, Scenario, Segment, Unit
-from imudrv.sim.unit import draw_true_unit, simulate
-from imudrv.units import ARCSEC, DEG_PER_H, UG
+from imudrv.sim.unit import simulate
 
 LAYOUT: Final = profiles.load("imu50-rs422").layout()
 """Layout of the simulated units."""
@@ -102,23 +101,8 @@ def subject(unit: Unit, seed: int, *, procedure: Sequence[str] = PROCEDURE) -> S
 
 def true_calibration(unit: Unit, seed: int) -> Calibration:
     """Return the calibration of the unit that a seed draws, which would leave no error."""
-    nominal = unit.calibration or NOMINAL
     seeded = unit.model_copy(update={"seed": seed})
-    drawn = draw_true_unit(scenarios.load(PROCEDURE[0]).model_copy(update={"unit": seeded}), LAYOUT)
-    return nominal.model_copy(
-        update={
-            "gyro": Gyro(
-                scale_arcsec_per_pulse=tuple((drawn.gyro_scale / ARCSEC).tolist()),
-                bias_deg_per_h=tuple((drawn.gyro_bias / DEG_PER_H).tolist()),
-                C_bg=_rows(drawn.C_bg),
-            ),
-            "accelerometer": Accelerometer(
-                scale_pulse_per_m_s=tuple(drawn.accelerometer_scale.tolist()),
-                bias_ug=tuple((drawn.accelerometer_bias / UG).tolist()),
-                C_ba=_rows(drawn.C_ba),
-            ),
-        }
-    )
+    return truth.true_calibration(scenarios.load(PROCEDURE[0]).model_copy(update={"unit": seeded}), LAYOUT)
 
 
 def scenario(name: str, align_s: float = ALIGNMENT_S) -> Scenario:
@@ -284,11 +268,6 @@ def _simulated_runs(name: str, unit: Unit, seed: list[int], known: Calibration) 
     options = NavigationOptions(RotationLimits() if name in PROCEDURE else ANY_MOTION)
     pulses = list(simulated_pulses(run))
     return navigate_capture(lambda: pulses, LAYOUT, known, run.site, name, options).runs
-
-
-def _rows(matrix: Array) -> Any:
-    """Return a matrix as tuples, as the file models have it."""
-    return tuple(map(tuple, matrix.tolist()))
 
 
 def simulated_pulses(run: Scenario) -> Iterator[Records]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from imudrv import profiles
+from imudrv.calibration import write_calibration
 from imudrv.cli.arguments import add_profile, message_stream
 from imudrv.errors import InputError
 from imudrv.files.outputs import require_other
@@ -15,6 +16,7 @@ from imudrv.service.printer import Printer
 from imudrv.sim import scenario as scenarios
 from imudrv.sim.capture import record
 from imudrv.sim.live import play
+from imudrv.sim.truth import true_calibration
 from imudrv.terminal import progress
 from imudrv.url import speed_of
 
@@ -31,7 +33,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     target.add_argument("-o", "--output", type=Path, metavar="CAPTURE", help=text)
     text = "send live on pty, serial://PATH, can://INTERFACE/CHANNEL or tcp://[HOST]:PORT"
     target.add_argument("--port", metavar="URL", help=text)
-    parser.add_argument("--truth", type=Path, metavar="FILE.npz", help="true motion, sample by sample")
+    text = "FILE.npz: true motion, sample by sample; FILE.yaml: calibration of the true unit"
+    parser.add_argument("--truth", type=Path, metavar="FILE", help=text)
     parser.add_argument("--speed", metavar="X", help="speed of a live run: 1, 10, ... or max (default: 1)")
     parser.add_argument("--link", metavar="NAME", help="stable name for the pty of a live run")
 
@@ -50,19 +53,22 @@ def _record(arguments: argparse.Namespace) -> None:
     layout = profiles.load(arguments.profile).layout()
     scenario = scenarios.load(arguments.scenario)
     samples = scenarios.samples(scenario, layout.interval)
-    if arguments.truth is not None and arguments.truth.suffix != ".npz":
-        raise InputError(f"--truth {arguments.truth}: expected a name ending in .npz")
+    of_motion = arguments.truth is not None and arguments.truth.suffix == ".npz"
+    if arguments.truth is not None and arguments.truth.suffix not in (".npz", ".yaml"):
+        raise InputError(f"--truth {arguments.truth}: expected a name ending in .npz or .yaml")
     for output in filter(None, (arguments.output, arguments.truth)):
         require_other(output, arguments.profile, *scenarios.files(arguments.scenario))
     with ExitStack() as stack:
         capture = stack.enter_context(writing(arguments.output))
         advance = stack.enter_context(progress("simulate", samples))
-        rows = stack.enter_context(table(arguments.truth, (".npz",), {})) if arguments.truth else None
+        rows = stack.enter_context(table(arguments.truth, (".npz",), {})) if of_motion else None
         for data, truth in record(scenario, layout):
             capture.write(data)
             if rows is not None:
                 rows.write({name: truth[name] for name in truth.dtype.names or ()})
             advance(len(truth))
+    if arguments.truth is not None and not of_motion:
+        write_calibration(arguments.truth, true_calibration(scenario, layout))
     print(
         f"{arguments.output}: {samples} samples of {layout.name}, seed {scenario.seed}",
         file=message_stream(arguments.output),

@@ -44,8 +44,11 @@ _Place: TypeAlias = tuple[str | int, ...]
 
 
 def header_faults(document: object, model: type[Model]) -> Iterator[str]:
-    """Yield the faults of `format` and `version`, compared by type too: pydantic takes true and 1.0 for 1."""
-    for name in ("format", "version"):
+    """Yield the faults of `format`, `version` and `kind`.
+
+    They are compared by type too: pydantic takes true and 1.0 for 1.
+    """
+    for name in ("format", "version", "kind"):
         field = model.model_fields.get(name)
         if field is None or get_origin(field.annotation) is not Literal:
             continue
@@ -53,7 +56,9 @@ def header_faults(document: object, model: type[Model]) -> Iterator[str]:
             continue
         allowed, came = get_args(field.annotation), document[name]
         if not any(type(came) is type(value) and came == value for value in allowed):
-            yield f"{name}: expected {' or '.join(map(str, allowed))}, got {shown_value(came)}"
+            advice = model.advice_for_value(name, came)
+            rest = shown_value(came) + (f"; {advice}" if advice else "")
+            yield f"{name}: expected {' or '.join(map(str, allowed))}, got {rest}"
 
 
 def validation_faults(error: ValidationError, document: object, model: type[Model]) -> list[str]:

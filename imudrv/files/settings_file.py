@@ -108,8 +108,8 @@ def parse(document: object, model: type[M], name: str) -> M:
     document : object
         Mappings, lists, text, numbers, dates.
     model : subclass of Model
-        Kind of file that is expected. A wrong `format` or `version` is the only fault reported: the rest then
-        belongs to another kind of file.
+        Kind of file that is expected. A wrong `format`, `version` or `kind` is the only fault reported: the
+        rest then belongs to another kind of file.
     name : str
         Name of the file in messages.
 

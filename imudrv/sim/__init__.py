@@ -4,6 +4,7 @@
     path        path of the body in one segment of motion, quadrature nodes
     integrate   path -> exact integrals over every sample interval
     unit        integrals -> pulses with the errors of the unit, and the truth
+    truth       true unit as a calibration
     faults      faults of the line on frames and messages
     capture     pulses -> wire bytes or CAN messages, as a capture
     live        the same in real time

@@ -50,6 +50,18 @@ poses:
   - {id: x-up, up: +X, east: +Y, turn_deg: 180}
   - {id: y-up, up: +Y, east: +Z, turn_deg: 180}
 """
+TURNS = """
+format: imu50-procedure
+version: 2
+name: turns
+align_s: 40
+rest_s: 4
+turn_s: [1.5, 2]
+poses:
+  - {id: z-up, up: +Z, east: +X, turn_deg: 180, turns: 4}
+  - {id: x-up, up: +X, east: +Y, turn_deg: 180, turns: 4}
+  - {id: y-up, up: +Y, east: +Z, turn_deg: 180, turns: 4}
+"""
 STEPS = ["z-up", "x-up", "y-up"]
 RUN = """
 import sys
@@ -91,12 +103,12 @@ Session.append = appended
 {RUN}"""
 
 
-def start(folder: Path, *redo: str, program: str = RUN) -> subprocess.Popen[str]:
+def start(folder: Path, *redo: str, program: str = RUN, procedure: str = PROCEDURE) -> subprocess.Popen[str]:
     """Begin or resume a rehearsal."""
-    procedure = folder.parent / "short.yaml"
-    procedure.write_text(PROCEDURE)
+    file = folder.parent / "short.yaml"
+    file.write_text(procedure)
     return subprocess.Popen(
-        [sys.executable, "-c", program, str(procedure), str(folder), *redo],
+        [sys.executable, "-c", program, str(file), str(folder), *redo],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -154,6 +166,9 @@ def test_the_operator_sees_every_step_and_the_result(
             assert any(step in line and words in line for line in said.splitlines())
     assert f"report: {folder / 'report.html'}" in said
     assert "residual velocity after half a turn" in said
+    # what the rehearsal knows of the truth is shown at its end only
+    assert said.count("rms error of the nine components") == 1
+    assert said.index("rms error of the nine components") > said.index("active certificate")
 
 
 def test_a_rehearsal_in_fast_time_is_not_reported_as_a_wrong_rate(undisturbed: tuple[Path, str]) -> None:
@@ -418,6 +433,42 @@ def test_a_session_killed_and_stopped_at_random_moments_is_resumed_with_the_same
     assert (np.abs(found.r_m - size_effect(whole).r_m) < 3.0 * 2.0**0.5 * sigma(found)).all()
 
 
+def test_a_session_killed_between_two_turns_repeats_only_that_run(tmp_path: Path) -> None:
+    folder = tmp_path / "killed"
+    process = start(folder, procedure=TURNS)
+    until(process, lambda: any(e["event"] == "turned" and e["step_id"] == "x-up" for e in journal(folder)))
+    process.kill()
+    process.communicate(timeout=DEADLINE_S)
+    with closing(Session.open(folder)) as session:
+        assert set(session.accepted) == {"z-up"}
+
+    said = ended(start(folder, procedure=TURNS))
+
+    accepted = {e["step_id"]: e for e in journal(folder) if e["event"] == "accepted"}
+    assert {name: (e["attempt"], e["turns"]) for name, e in accepted.items()} == {
+        "z-up": (1, 4),
+        "x-up": (2, 4),
+        "y-up": (1, 4),
+        "verification": (1, 1),
+    }
+    assert "step 3 of 3: Y up, turn 4 of 4 | rotate: ROTATE NOW -180" in said
+    check_true(folder)
+    assert verify(folder).faults == ()
+    labels = read_calibration(folder / "certificate.yaml").provenance
+    assert "y-up" in json.dumps(labels)
+
+
+def test_one_run_of_several_turns_can_be_done_again(tmp_path: Path) -> None:
+    folder = tmp_path / "redone"
+    process = start(folder, procedure=TURNS, program=INTERRUPTED_AFTER_Y_UP)
+    process.communicate(timeout=DEADLINE_S)
+    ended(start(folder, "x-up", procedure=TURNS))
+
+    attempts = [(e["step_id"], e["attempt"]) for e in journal(folder) if e["event"] == "accepted"]
+    assert attempts[-2:] == [("x-up", 2), ("verification", 1)]
+    check_true(folder)
+
+
 def test_ctrl_c_is_not_lost_while_compiled_code_is_loaded(tmp_path: Path) -> None:
     process = start(tmp_path / "session", program=INTERRUPTED_LOADING)
     out, err = process.communicate(timeout=DEADLINE_S)
@@ -515,7 +566,7 @@ def test_the_plan_contains_the_site_and_procedure_that_were_checked(
     def create(folder: Path, **about: Any) -> None:
         raise CreatedError(about["procedure"].text, about["site"].text)
 
-    monkeypatch.setattr("calib.bench.run.predicted", judge)
+    monkeypatch.setattr("calib.procedure.plan.predicted", judge)
     monkeypatch.setattr(Session, "create", create)
     options = RunOptions(
         tmp_path / "new",
@@ -529,6 +580,20 @@ def test_the_plan_contains_the_site_and_procedure_that_were_checked(
     with pytest.raises(CreatedError) as created:
         run(options, Console())
     assert created.value.args == texts
+
+
+def test_a_plan_is_shown_without_a_unit_and_makes_no_session(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, site = tmp_path / "new", tmp_path / "site.yaml"
+    site.write_text("{latitude_deg: 28.2, longitude_deg: 113.0, height_m: 60.0}\n")
+
+    assert run(RunOptions(folder, site=site, procedure="ten-turns", plan=True), Console(width=200)) == 0
+
+    assert "ten-turns: 30 rotations, about 9 min" in capsys.readouterr().out
+    assert not folder.exists()
+    with pytest.raises(InputError, match="--plan: expected --site, for the latitude, or --rehearse"):
+        run(RunOptions(folder, procedure="ten-turns", plan=True), Console())
 
 
 def test_a_new_session_needs_port_profile_calibration_and_site(tmp_path: Path) -> None:

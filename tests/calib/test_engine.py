@@ -29,6 +29,7 @@ from calib.procedure.events import (
     Restarted,
     Skip,
     Skipped,
+    Turned,
     View,
 )
 from calib.procedure.schema import Procedure
@@ -46,13 +47,15 @@ Z = {"id": "z", "up": "+Z", "east": "+X", "turn_deg": 180}
 Z_BACK = {"id": "z-back", "up": "+Z", "east": "-X", "turn_deg": -180}
 X = {"id": "x", "up": "+X", "east": "+Y", "turn_deg": 180}
 
+Z_TURNS = {**Z, "turns": 3}
+
 Bench = Callable[..., Records]
 
 
 def plan(*poses: dict[str, Any], **limits: float) -> Procedure:
     document = {
         "format": "imu50-procedure",
-        "version": 1,
+        "version": 2,
         "name": "test",
         "align_s": 30,
         "rest_s": 3,
@@ -738,3 +741,185 @@ def test_headlines_fit_a_screen_that_is_read_from_afar(drive: Drive, turned: Rec
     assert bells == sorted(bells)
     assert bells[-1] == 2  # the turn is due, the step is done
     assert driver.views[5].stillness == pytest.approx(1.0)
+
+
+# Several turns after one alignment
+
+
+@pytest.fixture
+def turns(bench: Bench, step: Any) -> Callable[..., Records]:
+    """Preflight and alignment, then these turns and rests, and a rest of 12 s."""
+    return lambda *steps: bench(step(CHECK_S + ALIGN_S), *(step(*one) for one in steps), step(12.0))
+
+
+Turns = Callable[..., Records]
+THERE, BACK, ARREST = (2.0, 180.0), (2.0, -180.0), (4.5,)
+
+
+def titles(driver: Driver) -> list[str]:
+    shown = [english(view.title) for view in driver.views]
+    return [b for a, b in pairwise(["", *shown]) if a != b]
+
+
+def test_a_step_of_three_turns_is_one_run(drive: Drive, turns: Turns) -> None:
+    driver = drive(Z_TURNS).feed(turns(THERE, ARREST, BACK, ARREST, THERE))
+
+    assert driver.phases == [
+        *("preflight", "place", "settle", "align"),
+        *("rotate", "rest") * 3,
+        *("verdict", "done"),
+    ]
+    assert [h for h in driver.headlines if h.startswith("ROTATE NOW")] == [
+        "ROTATE NOW +180",
+        "ROTATE NOW -180",
+        "ROTATE NOW +180",
+    ]
+    assert titles(driver) == [f"step 1 of 1: Z up, turn {turn} of 3" for turn in (1, 2, 3, 1)]
+    assert [(e.turn, round(e.angle_deg), e.reasons) for e in driver.of(Turned)] == [
+        (1, 180, ()),
+        (2, -180, ()),
+        (3, 180, ()),
+    ]
+    (accepted,) = driver.of(Accepted)
+    assert (accepted.turns, accepted.turns_within_limits) == (3, 3)
+    assert accepted.rest_before_s >= 3.0
+    assert accepted.rest_after_s >= 3.0
+    (log,) = driver.engine.runs
+    np.testing.assert_array_equal(np.diff(log.counter), 1)
+    assert log.counter[-1] == accepted.last_counter
+    # one alignment: the log begins before the first turn and goes on through all
+    assert log.counter[0] < driver.of(Turned)[0].counter - 1000
+    # the turns back add to what the turns there do to H: three times as much as one
+    first = log.H[log.counter == driver.of(Turned)[0].counter][0, :2]
+    assert np.linalg.norm(log.H[-1, :2]) == pytest.approx(3.0 * np.linalg.norm(first), rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("turn", "reasons_told", "within"),
+    [
+        ((2.0, -150.0), ["turned 150.0 deg, want 180 +- 5"], 2),
+        ((2.0, 180.0), ["wrong direction: +180 deg, expected -180"], 3),
+        (
+            (1.0, 40.0),
+            ["wrong direction: +40 deg, expected -180", "turned 40.0 deg, want 180 +- 5"],
+            2,
+        ),
+        ((8.0, -180.0), ["peak 42 deg/s: slower than 70, expect 4.2 mm"], 2),
+        ((2.0, -180.0, (0.1, 0.0, 1.0)), ["axis 5.7 deg off the vertical, want at most 3"], 2),
+    ],
+    ids=["short", "wrong way", "a little the wrong way", "slow", "tilted axis"],
+)
+def test_a_turn_outside_its_limits_is_reported_and_the_run_continues(
+    drive: Drive, turns: Turns, turn: Any, reasons_told: list[str], within: int
+) -> None:
+    driver = drive({**Z_TURNS, "turns": 4}, limits={"tilt_deg": 20.0, "axis_tilt_deg": 3.0})
+    driver.feed(turns(THERE, ARREST, turn, ARREST, THERE, ARREST, BACK))
+
+    assert not driver.of(Rejected)
+    second = driver.of(Turned)[1]
+    assert reasons(second) == reasons_told
+    resting = [v for v in driver.views if v.phase is Phase.REST and "turn 2 of 4" in english(v.title)]
+    assert all(view.reasons == second.reasons for view in resting)
+    assert [e.turn for e in driver.of(Turned)] == [1, 2, 3, 4]
+    (accepted,) = driver.of(Accepted)
+    assert (accepted.turns, accepted.turns_within_limits) == (4, within + 1)
+    assert f"{within + 1} of 4 turns within their limits" in driver.hints
+
+
+def test_more_turns_outside_their_limits_than_within_are_no_run(drive: Drive, turns: Turns) -> None:
+    driver = drive(Z_TURNS).feed(turns((2.0, 150.0), ARREST, (2.0, -150.0), ARREST, THERE))
+
+    (rejected,) = driver.of(Rejected)
+    assert reasons(rejected) == ["1 of 3 turns within their limits, expected at least half"]
+    assert driver.phases[-2:] == ["verdict", "place"]
+
+
+def test_a_bump_in_a_rest_repeats_the_rest_and_counts_as_no_turn(drive: Drive, turns: Turns) -> None:
+    driver = drive(Z_TURNS).feed(turns(THERE, (2.0,), (0.3, 1.0), ARREST, BACK, ARREST, THERE))
+
+    assert [round(e.angle_deg) for e in driver.of(Turned)] == [180, -180, 180]
+    assert driver.of(Accepted)[0].turns_within_limits == 3
+    told = {reason for view in driver.views for reason in reasons(view)}
+    assert any(reason.startswith("rest interrupted after 2.0 s of 3: the unit moved") for reason in told)
+    assert "moved 1.0 deg before the rotation: the rest is disturbed" in told
+    rests = [e.counter for e in driver.of(Entered) if e.phase is Phase.REST]
+    # the second rest begins after the bump and lasts whole, before the turn back is asked for
+    back = next(e for e in driver.of(Entered) if e.phase is Phase.ROTATE and e.counter > rests[1])
+    assert (back.counter - rests[1]) * 2e-3 > 3.0 - 1.2
+
+
+def test_a_bump_while_the_next_turn_is_due_repeats_the_rest(drive: Drive, turns: Turns) -> None:
+    driver = drive(Z_TURNS).feed(turns(THERE, (6.0,), (0.3, 1.0), ARREST, BACK, ARREST, THERE))
+
+    assert [round(e.angle_deg) for e in driver.of(Turned)] == [180, -180, 180]
+    assert not driver.of(Restarted)
+    assert driver.phases.count("rest") == 4
+
+
+def test_a_rest_cut_short_by_the_next_turn_is_reported_and_the_run_continues(
+    drive: Drive, turns: Turns
+) -> None:
+    driver = drive(Z_TURNS).feed(turns(THERE, (2.0,), BACK, ARREST, THERE))
+
+    assert [round(e.angle_deg) for e in driver.of(Turned)] == [180, -180, 180]
+    (accepted,) = driver.of(Accepted)
+    assert (accepted.turns, accepted.turns_within_limits) == (3, 3)
+    told = {reason for view in driver.views for reason in reasons(view)}
+    assert any(reason.startswith("rest interrupted after 2.0 s of 3: the unit moved") for reason in told)
+
+
+def at(samples: Records, seconds: float) -> int:
+    """Sample at a time after the alignment."""
+    return round((CHECK_S + ALIGN_S + seconds) / 2e-3)
+
+
+def test_an_axis_that_saturates_in_a_turn_ends_the_run(drive: Drive, turns: Turns) -> None:
+    samples = turns(THERE, ARREST, BACK, ARREST, THERE)
+    samples["flags"][at(samples, 7.5)] |= np.uint32(Flag.SATURATED)
+
+    driver = drive(Z_TURNS).feed(samples)
+
+    (rejected,) = driver.of(Rejected)
+    assert reasons(rejected) == ["an axis saturated during the rotation"]
+    assert [e.turn for e in driver.of(Turned)] == [1]
+    assert driver.phases[7:9] == ["verdict", "place"]
+
+
+@pytest.mark.parametrize(("when_s", "kind"), [(7.5, Rejected), (4.0, Rejected), (6.2, Restarted)])
+def test_lost_samples_end_the_run_and_another_alignment_is_asked_for(
+    drive: Drive, turns: Turns, when_s: float, kind: type[Event]
+) -> None:
+    samples = turns(THERE, ARREST, BACK, ARREST, THERE)
+    lost = at(samples, when_s)
+    samples = np.delete(samples, slice(lost, lost + 100))
+    samples["flags"][lost] |= np.uint32(Flag.MISSING_BEFORE)
+
+    driver = drive(Z_TURNS).feed(samples)
+
+    assert "100 samples missing" in reasons(driver.of(kind)[0])[0]
+    assert not driver.of(Accepted)
+    assert driver.engine.view.phase in (Phase.PLACE, Phase.SETTLE, Phase.ALIGN)
+
+
+def test_a_unit_that_is_lifted_from_its_pose_ends_the_run(drive: Drive, turns: Turns) -> None:
+    driver = drive(Z_TURNS).feed(turns(THERE, ARREST, (4.0, 90.0, (1.0, 0.0, 0.0)), ARREST))
+
+    (rejected,) = driver.of(Rejected)
+    assert reasons(rejected)[0] == "the Z side is no longer up: the run is over, align again"
+
+
+def test_a_pause_as_long_as_an_alignment_asks_for_another_one(drive: Drive, turns: Turns) -> None:
+    driver = drive(Z_TURNS).feed(turns(THERE, (50.0,)))
+
+    (restarted,) = driver.of(Restarted)
+    assert reasons(restarted) == ["no turn for 27 s: the alignment is too old, align again"]
+
+
+def test_any_cut_gives_the_same_events_of_several_turns(drive: Drive, turns: Turns) -> None:
+    samples = turns(THERE, (2.0,), (0.3, 1.0), ARREST, BACK, (2.0,), (2.0, 150.0))
+
+    whole = drive(Z_TURNS).feed(samples, len(samples)).events
+
+    assert drive(Z_TURNS).feed(samples, 1).events == whole
+    assert drive(Z_TURNS).feed(samples, 997).events == whole
+    assert len([event for event in whole if isinstance(event, Turned)]) == 3

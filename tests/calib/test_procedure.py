@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.procedure.plan import load, predicted, shipped
+from calib.procedure.plan import duration_s, load, predicted, shipped, text, verification
 from calib.procedure.schema import Procedure
 from imudrv.errors import FaultyFileError, InputError
 from imudrv.files.settings_file import parse
@@ -11,8 +11,9 @@ from imudrv.site import Site
 from imudrv.units import MM
 
 
-def procedure(*poses: dict[str, object], **others: object) -> Procedure:
-    document = {"format": "imu50-procedure", "version": 1, "name": "test", "poses": list(poses), **others}
+def procedure(*poses: dict[str, object], version: int = 1, **others: object) -> Procedure:
+    header = {"format": "imu50-procedure", "version": version, "name": "test"}
+    document = {**header, "poses": list(poses), **others}
     return parse(document, Procedure, "test")
 
 
@@ -110,7 +111,7 @@ def test_an_id_given_twice_is_refused() -> None:
 
 def test_a_procedure_that_is_not_there_names_the_shipped_ones() -> None:
     with pytest.raises(
-        InputError, match=r"'four': expected one of six-rotations, three-rotations, or the path"
+        InputError, match=r"'four': expected one of six-rotations, ten-turns, three-rotations, or the path"
     ):
         load("four")
 
@@ -126,3 +127,85 @@ def test_limits_reach_the_judge_of_the_rotation() -> None:
 
     assert (limits.angle_deg, limits.angle_tolerance_deg, limits.least_peak_deg_per_s) == (180.0, 2.0, 90.0)
     assert (limits.axis_tilt_deg, limits.rest_before_s, limits.rest_after_s) == (4.0, 60.0, 7.0)
+
+
+# Version 2
+
+
+TURNS: dict[str, object] = {"id": "z", "up": "+Z", "east": "+X", "turn_deg": 180, "turns": 4}
+
+
+def test_ten_turns_are_three_runs_of_about_nine_minutes() -> None:
+    plan = load("ten-turns")
+
+    assert [(s.id, s.up, s.turns, s.align_s, s.rest_s) for s in plan.steps] == [
+        ("z-up", "+Z", 10, 90.0, 4.0),
+        ("x-up", "+X", 10, 90.0, 4.0),
+        ("y-up", "+Y", 10, 90.0, 4.0),
+    ]
+    assert plan.turn_s == (1.5, 2.0)
+    assert 8.5 < duration_s(plan) / 60.0 < 9.5
+
+
+def test_every_second_turn_is_back_unless_the_file_says_otherwise() -> None:
+    to_and_fro, onwards = procedure(
+        TURNS, {**TURNS, "id": "a", "turn_deg": -180, "alternate": False}, version=2
+    ).steps
+
+    assert [to_and_fro.angle_deg(turn) for turn in (1, 2, 3, 4)] == [180, -180, 180, -180]
+    assert [onwards.angle_deg(turn) for turn in (1, 2, 3)] == [-180, -180, -180]
+
+
+@pytest.mark.parametrize(("turns", "east"), [(3, "-X"), (4, "+X")])
+def test_the_verification_begins_where_the_last_turn_has_ended(turns: int, east: str) -> None:
+    (step,) = verification(procedure({**TURNS, "turns": turns}, version=2)).steps
+
+    assert (step.id, step.turns, step.east) == ("verification", 1, east)
+
+
+@pytest.mark.parametrize(
+    ("pose", "others", "words"),
+    [
+        ({"repeats": 2}, {}, "poses[0]: expected turns or repeats above 1, got turns: 4 and repeats: 2"),
+        ({"turns": 21}, {}, "poses[0].turns: expected at most 20, got 21"),
+        ({}, {"version": 1}, "expected no turns in version 1, got one; write version: 2"),
+        ({"turns": 1}, {"version": 1, "turn_s": [1.5, 2]}, "expected no turn_s, turns in version 1"),
+        ({}, {"turn_s": [3, 2]}, "turn_s: expected the shorter duration first, got [3.0, 2.0]"),
+    ],
+)
+def test_nonsense_of_version_2_is_refused(
+    pose: dict[str, object], others: dict[str, object], words: str
+) -> None:
+    with pytest.raises(FaultyFileError) as caught:
+        procedure({**TURNS, **pose}, **{"version": 2, **others})  # type: ignore[arg-type]
+
+    (fault,) = caught.value.faults
+    assert fault.startswith(words)
+
+
+@pytest.mark.parametrize("kind", ["sensors", "noise"])
+def test_another_kind_of_procedure_is_refused_in_one_line(kind: str) -> None:
+    with pytest.raises(FaultyFileError) as caught:
+        procedure({"id": "z-up", "up": "+Z", "east": "+X"}, version=2, kind=kind)
+
+    (fault,) = caught.value.faults
+    assert fault == (
+        f"kind: expected arms, got text '{kind}'; this version does not run procedures of kind {kind}"
+    )
+
+
+def test_a_plan_shows_what_is_to_be_done_how_long_it_takes_and_how_accurate_it_is(site: Site) -> None:
+    shown = text(load("ten-turns"), site)
+
+    assert shown.startswith("ten-turns: 30 rotations, about 9 min\n")
+    assert (
+        "  x-up: X up, Y east; alignment of 90 s, then 10 x 180 deg in 1.5 to 2 s with a rest of 4 s" in shown
+    )
+    worst = predicted(load("ten-turns"), site).differences_sigma.max() / MM
+    assert f"{worst:.4f}" in shown
+
+
+def test_ten_turns_are_three_times_as_accurate_as_three_rotations(site: Site) -> None:
+    three, ten = (predicted(load(name), site).differences_sigma for name in ("three-rotations", "ten-turns"))
+
+    assert np.linalg.norm(ten) < np.linalg.norm(three) / 3.0
