@@ -69,7 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--skew-sigma-ms", type=_sigma, metavar="MS", help=text)
     text = (
         "1 sigma of the biases, scale factors and misalignments of the calibration; default: those in the "
-        "calibration, or else 100 ug, 50 ppm and 100 urad"
+        "calibration, or else 50 ug, 20 ppm and 100 urad"
     )
     add("--prior-sigma", type=_sigma, nargs=3, metavar=("UG", "PPM", "URAD"), help=text)
     add_certificate_output(parser)

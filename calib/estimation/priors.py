@@ -23,8 +23,8 @@ SHARED: Final = (
 class Priors:
     """Prior uncertainty: 1-sigma of the residual errors, independent unless a covariance is given.
 
-    The defaults are for a unit whose certificate says nothing, and wide: they cost 3 % of the accuracy of the
-    lever arms. With a misalignment m, lever arms r are uncertain by some m r.
+    The defaults are for a unit whose certificate says nothing, and wide for
+    the misalignments. With a misalignment m, lever arms r are uncertain by some m r.
 
     Attributes
     ----------
@@ -46,11 +46,11 @@ class Priors:
         Covariance of the errors `SHARED`, SI, in place of the first six; None: those six.
     """
 
-    accelerometer_bias: float = 100.0 * UG
-    accelerometer_scale: float = 50.0 * PPM
+    accelerometer_bias: float = 50.0 * UG
+    accelerometer_scale: float = 20.0 * PPM
     accelerometer_misalignment: float = 100.0 * URAD
     gyro_bias: float = 0.01 * DEG_PER_H
-    gyro_scale: float = 10.0 * PPM
+    gyro_scale: float = 5.0 * PPM
     gyro_misalignment: float = 100.0 * URAD
     accelerometer_bias_of_run: float = 30.0 * UG
     gyro_bias_of_run: float = 0.01 * DEG_PER_H
