@@ -377,6 +377,10 @@ class _RunBuilder:
         ends = [*(turn.start - guard for turn in self._turns), self._stop]
         rests = self._rests(samples["counter"], v_n, dv_a, rows)
         still = raw[first + round(SETTLING_S / self._interval_s) : begin]
+        lines = dither_lines(still["dtheta_b"], self._interval_s)
+        # dither hides the pulses
+        gyro = smooth[begin - len(still) : begin] if lines else still
+        gyro_pulse = np.zeros(3) if lines else setup.pulses.gyro
         time, up_b = self._time(still["counter"]), self._turns[0].before.up_b
         return Run(
             self._label,
@@ -390,9 +394,9 @@ class _RunBuilder:
             np.array([(begin <= counter) & (counter < end) for begin, end in zip(begins, ends, strict=True)]),
             read_rests(rests, A, setup.pulses.accelerometer),
             self._alignment.readings(),
-            random_walk(time, still["dtheta_b"] @ setup.pulses.G.T, setup.pulses.gyro, range(3)),
+            random_walk(time, gyro["dtheta_b"] @ setup.pulses.G.T, gyro_pulse, range(3)),
             self._velocity_walk(time, still["dv_b"] @ A.T, A @ up_b),
-            dither_lines(still["dtheta_b"], self._interval_s),
+            lines,
             self._filter,
         )
 
