@@ -27,6 +27,7 @@ Data flow; every module can be read alone::
     dither          effect of gyro dither on the size effect
     reports         reports as text, for a terminal and as HTML
     messages        texts for the operator, by key
+    signing         keys, and signatures of sessions and certificates
     api             functions for a notebook      cli  the command `calib`
 
 Increments are compensated for everything except the size effect. The conventions are those of `imudrv`.

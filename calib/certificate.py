@@ -9,9 +9,12 @@ import numpy as np
 from calib.identification import IdentificationResult, software
 from calib.lever_arms.gauge import LeverArms
 from calib.result_file import inputs_document, outcome_document
+from calib.signing import certificates
+from calib.signing.keys import BenchKey
 from imudrv.arrays import Array
-from imudrv.calibration import Calibration, SensingPoints, SizeEffect, read_calibration, write_calibration
+from imudrv.calibration import Calibration, SensingPoints, SizeEffect, read_calibration
 from imudrv.errors import FaultyFileError, InputError
+from imudrv.files import settings_file
 from imudrv.units import MM
 
 PROVENANCE_IDENTIFIED: Final = "inner_lever_arms"
@@ -157,7 +160,7 @@ def check_target(path: Path, calibration: Calibration) -> None:
         raise InputError(f"{wanted}, got that of {serial_number!r}; choose another name")
 
 
-def write(path: Path, calibration: Calibration) -> None:
+def write(path: Path, calibration: Calibration, key: BenchKey | None) -> None:
     """Write a certificate; an existing one is kept under its date.
 
     Parameters
@@ -166,6 +169,8 @@ def write(path: Path, calibration: Calibration) -> None:
         The file.
     calibration : Calibration
         Calibration of the unit.
+    key : BenchKey or None
+        The key of the bench, which signs it; None: unsigned.
 
     Raises
     ------
@@ -173,7 +178,7 @@ def write(path: Path, calibration: Calibration) -> None:
         See `check_target`; or the file cannot be written.
     """
     check_target(path, calibration)
-    write_calibration(path, calibration)
+    settings_file.replace(path, certificates.content(calibration, key))
 
 
 def sensing_points(r_mm: Array) -> SensingPoints:

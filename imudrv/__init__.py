@@ -20,7 +20,7 @@ The flow is one way; each stage is a package or module that can be read alone::
     imu    accounts for every sample (`SequenceTracker`), stamps it (`ClockModel`),
            compensates it (`Compensator`)
     sinks  destinations of increments, by URL, and the recorder
-    pipeline, service   the stages in a row, and the one thread that runs them live
+    chain, service   the stages in a row, and the one thread that runs them live
     capture, recording  the same from files; capture_files reads these in all their forms
     nav    strapdown mathematics      sim    simulated unit
 

@@ -128,6 +128,10 @@ Skew = Annotated[float, Key(ge=-100, le=100)]
 Celsius = Annotated[float, Key(ge=-100, le=200)]
 Arm = Annotated[float, Key(ge=-1000, le=1000)]
 Axes = Annotated[Matrix3, AfterValidator(_axes)]
+SerialNumber = Annotated[str, Key(max_length=64), AfterValidator(_serial_number)]
+# Base64 in its one canonical form: no other text stands for the same bytes.
+Base64Of32Bytes = Annotated[str, Key(pattern=r"^[A-Za-z0-9+/]{42}[AEIMQUYcgkosw048]=$")]
+Base64Of64Bytes = Annotated[str, Key(pattern=r"^[A-Za-z0-9+/]{85}[AQgw]==$")]
 
 
 def _array(values: object, unit: float = 1.0) -> Array:
@@ -246,18 +250,26 @@ class Temperature(Model):
     accelerometer_scale_ppm_per_k: tuple[ScaleSlope, ScaleSlope, ScaleSlope]
 
 
+class Signature(Model):
+    """An Ed25519 signature and the public key that it belongs to; see `calib.signing`."""
+
+    public_key: Base64Of32Bytes
+    ed25519: Base64Of64Bytes
+
+
 class Calibration(Model):
     """The certificate of one unit.
 
     Without `size_effect` the size effect is not compensated; without `temperature` nothing depends on the
     temperature. `skew_ms`: time by which the samples of the accelerometers end later than those of the gyros.
     `provenance` describes how the calibration was made; it is preserved unchanged. Its `sensors` is a
-    `SensorsProvenance`; the covariance there names numbers of this certificate.
+    `SensorsProvenance`; the covariance there names numbers of this certificate. `signature` belongs to the
+    bytes of one file: it is the last key there, and no copy of the model is written with it.
     """
 
     format: Literal["imu50-calibration"]
     version: Literal[1]
-    serial_number: Annotated[str, Key(max_length=64), AfterValidator(_serial_number)]
+    serial_number: SerialNumber
     created: UtcTime
     gyro: Gyro
     accelerometer: Accelerometer
@@ -266,6 +278,7 @@ class Calibration(Model):
     skew_ms: Skew | None = None
     noise: Noise | None = None
     provenance: Annotated[dict[str, JsonValue], AfterValidator(_provenance)] | None = None
+    signature: Annotated[Signature | None, Key(exclude=True)] = None
 
     @model_validator(mode="after")
     def _covariance_names_numbers(self) -> Self:
@@ -362,7 +375,7 @@ def require_unit(calibration: Calibration, unit: str | None, name: str) -> None:
 
 
 def write_calibration(path: str | os.PathLike[str], calibration: Calibration) -> None:
-    """Write a calibration; an existing file is kept under a name with its time.
+    """Write a calibration, unsigned; an existing file is kept under a name with its time.
 
     Parameters
     ----------

@@ -50,7 +50,7 @@ class Capture:
     ----------
     path : Path
     size : int
-        Size of the file as it is stored, bytes.
+        Size of the file as it is stored, bytes; of a pipe what was read so far.
     file : CaptureFile
         What the file is.
     is_profile_found : bool
@@ -85,7 +85,6 @@ class Capture:
     ) -> None:
         self.path = path = Path(path)
         self.file = CaptureFile(path)
-        self.size = self.file.size
         self.recording = Recording(path) if self.file.is_recording else None
         self._channel = channel
         self.is_profile_found = profile is None and self.recording is None
@@ -105,6 +104,11 @@ class Capture:
         self.tracker = SequenceTracker(self.layout)
         self._gaps = 0
         self._counters = np.zeros(0, np.int64)
+
+    @property
+    def size(self) -> int:
+        """See the class."""
+        return self.file.size
 
     @property
     def sequence_fault(self) -> str:
@@ -218,7 +222,7 @@ class Capture:
                 advance(piece.bytes_read)
         else:
             self._decoder = frame_decoder = FrameDecoder(self.layout)
-            for reads in self.recording.reads():
+            for reads in self.recording.reads(self.layout):
                 self._clock.follow(reads.timebase)
                 yield frame_decoder.feed_reads(reads.data, reads.ends, reads.times)
                 advance(reads.data.nbytes)

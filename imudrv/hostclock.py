@@ -44,7 +44,7 @@ else:
 
 def now_ns() -> int:
     """Time now on the scale of the arrivals, ns since the UNIX epoch as of the start of the process."""
-    return _steady_ns() + _OFFSET_NS
+    return _steady_ns() + OFFSET_NS
 
 
 def read_clocks() -> Readings:
@@ -62,4 +62,5 @@ def _unix_offset_ns() -> int:
     return min(comparisons)[1]
 
 
-_OFFSET_NS: Final = _unix_offset_ns()
+OFFSET_NS: Final = _unix_offset_ns()
+"""`now_ns` less the steady clock of the system, ns."""

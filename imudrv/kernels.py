@@ -1,7 +1,7 @@
 """The decorator of every numba kernel: compiled once for a user, and never stale.
 
-numba keeps compiled code beside the source and looks only at the file that holds the kernel, so a change in a
-helper of another file would go unseen. Here the cache folder carries a hash of all sources that kernels read.
+A change in a helper of another file changes a kernel too, so the name of the folder of compiled kernels has a
+hash of all sources that kernels read.
 """
 
 import hashlib
@@ -13,24 +13,38 @@ from typing import Any, Final, TypeVar, cast
 from numba import njit
 from numba.core import config
 
+from imudrv.kernel_cache import keep_compiled, take_literals_as_variables
+
 F = TypeVar("F", bound=Callable[..., Any])
 
-CONSTANTS: Final = ("arrays.py", "records.py", "units.py", "wire/layout.py", "wire/tables.py")
+CONSTANTS: Final = (
+    "arrays.py",
+    "ports/base.py",
+    "records.py",
+    "units.py",
+    "service/clock_watch.py",
+    "wire/layout.py",
+    "wire/tables.py",
+)
 """Files without kernels whose constants and types kernels read."""
 
 
-def _cache_folder() -> str:
+def _cache_folder() -> Path | None:
     package = Path(__file__).parent
     digest = hashlib.sha256()
     for source in sorted(package.rglob("*.py")):
         text = source.read_bytes()
         if b"@kernel" in text or source.relative_to(package).as_posix() in CONSTANTS:
             digest.update(text)
-    home = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return str(Path(home) / "imu50" / f"kernels-{digest.hexdigest()[:16]}")
+    try:
+        home = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    except RuntimeError:  # a user without a home
+        return None
+    return Path(home) / "imu50" / f"kernels-{digest.hexdigest()[:16]}"
 
 
-_FOLDER = _cache_folder()
+FOLDER: Final = _cache_folder()
+"""Folder of compiled kernels; None for a user without a home."""
 
 
 def kernel(function: F) -> F:
@@ -46,10 +60,9 @@ def kernel(function: F) -> F:
     callable
         The same function, compiled; releases the interpreter lock, divides as IEEE 754 says.
     """
+    compiled = njit(nogil=True, error_model="numpy", forceinline=True)(function)
     settings: Any = config  # numba makes its settings' names at run time
-    before = settings.CACHE_DIR
-    settings.CACHE_DIR = _FOLDER
-    try:
-        return cast(F, njit(cache=True, nogil=True, error_model="numpy", forceinline=True)(function))
-    finally:
-        settings.CACHE_DIR = before
+    if not settings.DISABLE_JIT:
+        keep_compiled(compiled, FOLDER)
+        take_literals_as_variables(compiled)
+    return cast(F, compiled)

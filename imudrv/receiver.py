@@ -6,7 +6,6 @@ with imudrv.receive("udp://:5005") as receiver:
 print(receiver.counts)
 """
 
-import os
 import select
 import socket
 from contextlib import AbstractContextManager
@@ -19,12 +18,14 @@ import serial
 
 from imudrv.errors import InputError
 from imudrv.imu.sequence import SampleCounts, SequenceTracker
+from imudrv.loopback import LOOPBACK
 from imudrv.ports.base import PortLostError
-from imudrv.ports.serial import explain
+from imudrv.ports.serial import explain, receiver_of
+from imudrv.posix import require_posix
 from imudrv.profiles.schema import SerialLine
 from imudrv.records import FRAME, Records
 from imudrv.sinks.serial import BAUDRATE
-from imudrv.url import LOOPBACK, Url, device_path, host_and_port, serial_settings, split
+from imudrv.url import Url, device_path, host_and_port, serial_settings, split
 from imudrv.wire.datagram import DatagramDecoder
 from imudrv.wire.layout import Layout, Sequence, SequenceKind
 
@@ -70,6 +71,7 @@ class Receiver(AbstractContextManager["Receiver"]):
         parts = split(url, ("udp", "tcp", "serial"))
         self._is_packets = parts.scheme == "udp"
         self._device = _open(parts)
+        self._receive = receiver_of(self._device)
         self._is_open = True
 
     @property
@@ -90,7 +92,7 @@ class Receiver(AbstractContextManager["Receiver"]):
         """
         while self._is_open and select.select([self._device.fileno()], (), (), self._timeout_s)[0]:
             try:
-                data = os.read(self._device.fileno(), _AT_ONCE)
+                data = self._receive(_AT_ONCE)
             except OSError:
                 data = b""
                 self.close()
@@ -173,6 +175,7 @@ def _listen(host: str, port: int) -> socket.socket:
 
 
 def _open_line(url: Url) -> serial.Serial:
+    require_posix(url.text, "receive from udp:// or tcp:// instead")
     path, settings = device_path(url), serial_settings(url, SerialLine(baudrate=BAUDRATE))
     try:
         return serial.Serial(path, **settings, timeout=0, exclusive=True)

@@ -81,7 +81,11 @@ def samples_type(*, gyro_pulses: bool, accelerometer_pulses: bool) -> np.dtype[n
 
 
 PULSES: Final = samples_type(gyro_pulses=True, accelerometer_pulses=True)
-"""One sample of pulse increments, its losses accounted for."""
+"""One sample of pulse increments, its losses accounted for.
+
+Kernels read and write samples of any unit as PULSES, increments in SI units as the bits of a float64, so that
+they are compiled once.
+"""
 
 INCREMENTS: Final = np.dtype(
     [

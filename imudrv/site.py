@@ -1,13 +1,14 @@
 """Location of the unit: the site file."""
 
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field as Key
 
 from imudrv.files.model import Model
-from imudrv.nav.earth import normal_gravity
-from imudrv.nav.mechanisation import Place
 from imudrv.units import DEG
+
+if TYPE_CHECKING:
+    from imudrv.nav.mechanisation import Place
 
 
 class Site(Model):
@@ -41,9 +42,13 @@ class Site(Model):
         """Measured gravity, or else normal gravity, m/s^2."""
         if self.gravity_m_s2 is not None:
             return self.gravity_m_s2
+        from imudrv.nav.earth import normal_gravity  # a kernel: a file is checked without any
+
         return normal_gravity(self.latitude_rad, self.height_m)
 
     @property
-    def place(self) -> Place:
+    def place(self) -> "Place":
         """The location as `imudrv.Navigator` takes it."""
+        from imudrv.nav.mechanisation import Place
+
         return Place(self.latitude_rad, self.longitude_rad, self.height_m, self.gravity_m_s2)

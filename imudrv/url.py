@@ -1,5 +1,6 @@
 """URLs of ports, outputs and simulated lines: parts, options, settings of a serial line."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -12,7 +13,7 @@ from imudrv.profiles.schema import SerialLine
 PYSERIAL: Final = ("socket", "rfc2217", "spy", "hwgrep", "alt", "loop", "cp2110")
 PORTS: Final = ("serial", *PYSERIAL, "can", "replay", "sim")
 """Schemes of ports."""
-LOOPBACK: Final = "127.0.0.1"
+_WINDOWS_PORT: Final = re.compile(r"COM\d+", re.IGNORECASE)
 SLOWEST: Final = 1e-3
 FASTEST: Final = 1e6
 
@@ -49,7 +50,7 @@ def split(text: str, schemes: Sequence[str] = PORTS) -> Url:
     Parameters
     ----------
     text : str
-        URL, or the path of a serial device: ``/dev/ttyUSB0``.
+        URL, or the name of a serial device: ``/dev/ttyUSB0``, on Windows ``COM3``.
     schemes : sequence of str
         Schemes that are possible.
 
@@ -64,12 +65,14 @@ def split(text: str, schemes: Sequence[str] = PORTS) -> Url:
     """
     before, _, query = text.partition("?")
     scheme, found, address = before.partition("://")
-    if not found and before.startswith("/"):
+    if not found and (before.startswith("/") or _WINDOWS_PORT.fullmatch(before)):
         scheme, address = "serial", before
     if scheme.lower() not in schemes:
         known = ", ".join(f"{scheme}://" for scheme in schemes)
         path = " or a path like /dev/ttyUSB0," if "serial" in schemes else ""
         raise InputError(f"{text}: expected a URL that begins with {known},{path} got {before!r}")
+    if not query.isprintable():
+        raise InputError(f"{text}: expected options of printable text, got {query!r}")
     try:
         pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=True) if query else []
     except ValueError:
@@ -106,14 +109,14 @@ def host_and_port(url: Url, default_host: str | None = None) -> tuple[str, int]:
 
 
 def device_path(url: Url) -> str:
-    """Return the path of a serial device.
+    """Return the path of a serial device, on Windows its name.
 
     Raises
     ------
     InputError
         The path is not absolute.
     """
-    if not url.address.startswith("/"):
+    if not url.address.startswith("/") and not _WINDOWS_PORT.fullmatch(url.address):
         raise InputError(
             f"{url.text}: expected the path of a device like serial:///dev/ttyUSB0 (three slashes), "
             f"got {url.address!r}"

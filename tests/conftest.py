@@ -17,6 +17,14 @@ _DATA = Path(__file__).parents[2] / "shared" / "data"
 ReplacedAtRandom: TypeAlias = Callable[..., AbstractContextManager[None]]
 
 
+@pytest.fixture(scope="session", autouse=True)
+def no_key_of_the_bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Nothing is signed with the key of whoever runs the tests, also not by processes that they start."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CONFIG_HOME", str(tmp_path_factory.mktemp("config")))
+        yield
+
+
 @pytest.fixture(scope="session")
 def data() -> Path:
     """The folder of captures that may lie beside the project; they are not part of it."""

@@ -44,7 +44,7 @@ def record(path: Path, samples: int) -> None:
         increments["flags"] = 1
         recorder.arrived(Arrival(1000 + n, b"%044d" % n))
         recorder.publish(Batch(np.zeros(1, PULSES), increments, encode(increments, Source.SIMULATOR)))
-    recorder.status({"rate_hz": 1000.0})
+    recorder.status(lambda: {"rate_hz": 1000.0})
     recorder.event(5000, "unplugged")
     recorder.calibration(6000, CERTIFICATE.replace("0.5, 0.5, 0.5", "0.6, 0.6, 0.6").encode())
     recorder.close()

@@ -1,14 +1,13 @@
 """The commands as a user runs them: real processes, real files, exit codes and messages."""
 
 import argparse
-import os
 import re
 import shlex
 import signal
 import subprocess
 import sys
 from collections.abc import Callable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from hashlib import sha256
 from importlib import import_module
 from importlib.metadata import version
@@ -135,7 +134,7 @@ def test_a_candump_log_works_for_the_can_profiles(bench: Path) -> None:
     [
         (
             ["decode", "nothing.raw", "--profile", "imu50-rs422", "-o", "o.npz"],
-            "nothing.raw: expected a capture",
+            "nothing.raw: expected a file, there is none; check the path",
         ),
         (
             ["decode", "run.raw", "--profile", "imu51", "-o", "o.npz"],
@@ -294,12 +293,18 @@ def test_ctrl_c_leaves_no_half_file(bench: Path) -> None:
     )
 
     def is_in_the_middle() -> bool:
-        """While kernels are loaded an interrupt may end in a callback of the compiler, and be lost."""
         assert process.poll() is None
         return any(half.stat().st_size for half in bench.glob(".long.raw.*"))
 
+    def has_ended() -> bool:
+        """While kernels are loaded an interrupt may end in a callback of the compiler: it is repeated."""
+        process.send_signal(signal.SIGINT)
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(1.0)
+        return process.poll() is not None
+
     until(is_in_the_middle)
-    os.kill(process.pid, signal.SIGINT)
+    until(has_ended)
     _, errors = process.communicate(timeout=300)
     assert process.returncode == 130, errors
     assert b"Traceback" not in errors
@@ -360,6 +365,21 @@ def test_help_version_and_status_load_no_numerical_library(
     loaded = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
     assert f"{program}.cli" in loaded
     assert not loaded & HEAVY
+
+
+@pytest.mark.parametrize("kind", ["calibration", "site", "profile", "scenario"])
+def test_a_file_is_checked_without_a_compiler(bench: Path, kind: str) -> None:
+    files = {
+        "calibration": bench / "unit.yaml",
+        "site": bench / "site.yaml",
+        "profile": ROOT / "imudrv" / "profiles" / "imu50-can.yaml",
+        "scenario": bench / "run.yaml",
+    }
+    files["site"].write_text("{format: imu50-site, latitude_deg: 28.2, longitude_deg: 113.0, height_m: 60.0}")
+    command = [sys.executable, "-X", "importtime", "-m", "imudrv", "check", str(files[kind])]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "valid" in done.stdout
+    assert not re.findall(r"\| +(numba|llvmlite|scipy)$", done.stderr, re.MULTILINE)
 
 
 @pytest.mark.parametrize(

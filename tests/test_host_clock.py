@@ -17,10 +17,10 @@ from samples import CERTIFICATE
 
 from imudrv import compensate, profiles
 from imudrv.calibration import coefficients, write_calibration
+from imudrv.chain import Chain
 from imudrv.errors import InputError
 from imudrv.hostclock import Readings, now_ns, read_clocks
 from imudrv.imu.clock import ClockModel
-from imudrv.pipeline import Pipeline
 from imudrv.recording import format
 from imudrv.recording.pack import pack
 from imudrv.recording.reader import Recording
@@ -359,15 +359,15 @@ def test_live_and_offline_agree_wherever_the_steps_and_the_reads_fall(
     edges = [0, *sorted(cuts), 44 * 400, 44 * 401, len(wire)]
     reads = [bytes(wire[a:b]) for a, b in pairwise(sorted(edges)) if a < b]
     arrivals = [Arrival(BEGIN + k * MS, data, bases[k % len(bases)]) for k, data in enumerate(reads)]
-    pipeline = Pipeline(profiles.load("imu50-rs422"), coefficients(NOMINAL), "dither")
+    chain = Chain(profiles.load("imu50-rs422"), coefficients(NOMINAL), "dither")
     live = []
     with TemporaryDirectory() as folder:
         kept = recorder(Path(folder) / "run.mcap")
         for arrival in arrivals:
             kept.arrived(arrival)
-            pipeline.clock.follow(arrival.timebase)
-            live.append(pipeline.feed(arrival.data, arrival.t_ns).increments)
-        live.append(pipeline.close().increments)
+            chain.clock.follow(arrival.timebase)
+            live.append(chain.feed(arrival.data, arrival.t_ns).increments)
+        live.append(chain.close().increments)
         kept.close()
         offline = compensate(Path(folder) / "run.mcap", NOMINAL, rate_filter="dither")
     np.testing.assert_array_equal(offline, np.concatenate(live))
@@ -378,6 +378,7 @@ def wire_only(path: Path, clock: bytes | None) -> None:
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
+        writer.add_attachment(0, 0, format.PROFILE, "", profiles.content("imu50-rs422"))
         wire = writer.register_channel(format.WIRE, format.BYTES, 0)
         if clock is not None:
             writer.add_message(writer.register_channel(format.CLOCK, "json", 0), BEGIN, clock, BEGIN)

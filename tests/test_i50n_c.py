@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 from realtime import DEADLINE_S, free_port
 
+import imudrv
 from imudrv.records import INCREMENTS, Flag, Records, Source
 from imudrv.wire.datagram import SIZE, encode
 
-TOOLS = Path(__file__).parents[1] / "tools"
+SHARE = Path(imudrv.__file__).parent / "share"
 STRICT = ("-Wall", "-Wextra", "-Werror", "-std=c99", "-pedantic")
 
 # ICD, section 7.
@@ -57,7 +58,7 @@ def cc() -> str:
 @pytest.fixture(scope="module")
 def receiver(cc: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     program = tmp_path_factory.mktemp("c") / "i50n_receiver"
-    subprocess.run([cc, *STRICT, "-o", program, TOOLS / "i50n_receiver.c"], check=True)
+    subprocess.run([cc, *STRICT, "-o", program, SHARE / "i50n_receiver.c"], check=True)
     return program
 
 
@@ -65,7 +66,7 @@ def receiver(cc: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def decode(cc: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("c")
     (folder / "decode.c").write_text(DECODE)
-    command = [cc, *STRICT, f"-I{TOOLS}", "-o", folder / "decode", folder / "decode.c"]
+    command = [cc, *STRICT, f"-I{SHARE}", "-o", folder / "decode", folder / "decode.c"]
     # Where the sanitizers are installed they see what a warning does not: overruns, unaligned access.
     sanitized = [*command, "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
     if subprocess.run(sanitized, check=False, capture_output=True).returncode:
@@ -214,7 +215,7 @@ def result(program: Path, data: bytes) -> str:
 
 def number(name: str) -> str:
     """Of a result, as the header has it."""
-    results = re.search(r"enum i50n_result \{(.*?)\}", (TOOLS / "i50n.h").read_text())
+    results = re.search(r"enum i50n_result \{(.*?)\}", (SHARE / "i50n.h").read_text())
     assert results
     return str(re.findall(r"I50N_\w+", results.group(1)).index(name))
 
@@ -247,7 +248,7 @@ def test_one_changed_bit_is_detected(decode: Path, at: int) -> None:
 
 
 def test_the_flags_are_those_of_the_driver() -> None:
-    text = (TOOLS / "i50n.h").read_text()
+    text = (SHARE / "i50n.h").read_text()
     found = {name: 1 << int(bit) for name, bit in re.findall(r"I50N_(\w+) = 1 << (\d+)", text)}
     assert found == {flag.name: flag.value for flag in Flag}
 
@@ -260,6 +261,6 @@ def test_the_header_is_cpp_too(tmp_path: Path) -> None:
     source.write_text(
         '#include "i50n.h"\nint main() { i50n_sample s; return i50n_decode(nullptr, 0, &s) != 1; }\n'
     )
-    options = ["-Wall", "-Wextra", "-Werror", "-std=c++11", "-pedantic", f"-I{TOOLS}"]
+    options = ["-Wall", "-Wextra", "-Werror", "-std=c++11", "-pedantic", f"-I{SHARE}"]
     subprocess.run([compiler, *options, "-o", tmp_path / "uses", source], check=True)
     subprocess.run([tmp_path / "uses"], check=True)

@@ -106,9 +106,3 @@ def test_a_missing_calibration_or_a_second_profile_is_an_error_that_says_what_to
         imudrv.compensate(capture)
     with pytest.raises(imudrv.InputError, match="no profile beside a Capture"):
         imudrv.compensate(capture, "unit.yaml", profile="imu50-can")
-
-
-def test_a_recording_that_was_cut_before_its_profile_has_a_repr(here: Path, tmp_path: Path) -> None:
-    cut = tmp_path / "cut.mcap"
-    cut.write_bytes(Path("run.mcap").read_bytes()[:10])
-    assert repr(imudrv.Recording(str(cut))) == f"<Recording {cut}, no profile, cut>"

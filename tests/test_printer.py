@@ -75,3 +75,9 @@ def test_without_an_output_nothing_is_missed() -> None:
     with Printer(None) as printer:
         printer.say("to nobody")
     assert printer.lost == 0
+
+
+def test_control_sequences_in_a_name_are_printed_as_text(tmp_path: Path) -> None:
+    with (tmp_path / "text").open("w") as text, Printer(text) as printer:
+        printer.say("port \x1b[2J\x07 not available")
+    assert (tmp_path / "text").read_text() == "port \\x1b[2J\\x07 not available\n"

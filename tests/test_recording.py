@@ -1,7 +1,10 @@
+import re
 import struct
-import zlib
+import tracemalloc
+from contextlib import suppress
 from pathlib import Path
 
+import lz4.frame
 import numpy as np
 import pytest
 import zstandard
@@ -12,6 +15,7 @@ from mcap.writer import CompressionType, Writer
 from samples import CERTIFICATE, record
 
 from imudrv import profiles
+from imudrv.capture import Capture
 from imudrv.errors import FaultyFileError, InputError
 from imudrv.recording import reader
 from imudrv.recording.format import pack_messages, unpack_messages
@@ -74,20 +78,17 @@ def test_a_recording_cut_at_any_byte_opens_up_to_the_cut(recorded: Path, tmp_pat
     arrivals = list(Recording(recorded).arrivals())
     ends = [at + 9 + 22 + 44 for at in places_of(whole, 5)[: len(arrivals)]]
     path = tmp_path / "cut.mcap"
+    profile = places_of(whole, 9)[0]
+    with_profile = profile + 9 + struct.unpack_from("<Q", whole, profile + 1)[0]
     for size in range(len(whole)):
         path.write_bytes(whole[:size])
+        if size < with_profile:
+            with pytest.raises(InputError, match=r"cut\.mcap.*cut before it, there is nothing in it"):
+                Recording(path)
+            continue
         recording = Recording(path)
         assert recording.cut
         assert list(recording.arrivals()) == arrivals[: sum(end <= size for end in ends)]
-
-
-def test_a_recording_that_was_cut_before_its_profile_says_so(recorded: Path, tmp_path: Path) -> None:
-    path = tmp_path / "cut.mcap"
-    path.write_bytes(recorded.read_bytes()[:100])
-    with pytest.raises(InputError, match=r"cut\.mcap.*cut before it, there is nothing in it"):
-        _ = Recording(path).profile
-    assert Recording(path).origin == {}
-    assert Recording(path).calibration is None
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))
@@ -149,7 +150,7 @@ def test_a_cut_recording_is_packed_up_to_its_cut_and_in_place(recorded: Path, tm
 
 def test_other_files_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "other"
-    with pytest.raises(InputError, match="expected a recording, cannot read it: No such file"):
+    with pytest.raises(InputError, match="expected a file, there is none"):
         Recording(path)
     path.write_bytes(b"\xeb\x90\x50\x26" * 100)
     with pytest.raises(InputError, match=r"expected a recording \(MCAP\), got another kind of file"):
@@ -161,7 +162,7 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(
         InputError, match=r"expected a recording with its profile\.yaml, got none: it is not from this driver"
     ):
-        _ = Recording(path).profile
+        Recording(path)
 
 
 @pytest.mark.parametrize("opcode", [1, 3, 4, 5, 9, 12])
@@ -177,28 +178,111 @@ def test_a_record_of_absurd_length_is_not_read_but_reported_with_its_place(
         list(Recording(path).arrivals())
 
 
-def test_a_chunk_that_unpacks_to_more_than_it_says_is_refused(recorded: Path, tmp_path: Path) -> None:
-    bomb = zlib.compress(b"")  # any bytes; the claims are what matters
-    path = tmp_path / "bad.mcap"
+def record_of(opcode: int, body: bytes) -> bytes:
+    return struct.pack("<BQ", opcode, len(body)) + body
 
-    def chunk(compression: bytes, size: int, data: bytes) -> bytes:
-        body = struct.pack("<QQQII", 0, 0, size, 0, len(compression)) + compression
-        body += struct.pack("<Q", len(data)) + data
-        return struct.pack("<BQ", 6, len(body)) + body
 
-    zeros = zstandard.compress(bytes(1 << 26))
-    for record_, message in (
-        (chunk(b"zstd", 1000, zeros), "length and check are right"),
-        (chunk(b"zstd", 1 << 40, zeros), "at most"),
-        (chunk(b"zstd", 1000, bomb), "unpacks"),
-        (chunk(b"lz4", 1000, bomb), "unpacks"),
-        (chunk(b"rar", 1000, bomb), "unknown compression 'rar'"),
-        (chunk(b"", 1 << 10, chunk(b"", 0, b"")), "length and check are right"),
-        (chunk(b"", len(chunk(b"", 0, b"")), chunk(b"", 0, b"")), "no chunk inside of a chunk"),
-    ):
-        path.write_bytes(recorded.read_bytes()[:8] + record_)
-        with pytest.raises(InputError, match=rf"at byte 8: .*{message}"):
-            list(Recording(path).arrivals())
+def text_of(text: bytes) -> bytes:
+    return struct.pack("<I", len(text)) + text
+
+
+def channel(number: int, topic: bytes) -> bytes:
+    return record_of(4, struct.pack("<HH", number, 0) + text_of(topic) + text_of(b"bytes") + text_of(b""))
+
+
+def message(number: int, data: bytes) -> bytes:
+    return record_of(5, struct.pack("<HIQQ", number, 0, 0, 0) + data)
+
+
+def chunk(compression: bytes, data: bytes, size: int | None = None) -> bytes:
+    """A chunk of data that are not packed yet; `size` is what it declares."""
+    packed = {b"zstd": zstandard.compress, b"lz4": lz4.frame.compress}.get(compression, bytes)(data)
+    body = struct.pack("<QQQI", 0, 0, len(data) if size is None else size, 0) + text_of(compression)
+    return record_of(6, body + struct.pack("<Q", len(packed)) + packed)
+
+
+def beginning(recorded: Path) -> bytes:
+    """A recording up to its first message."""
+    data = recorded.read_bytes()
+    return data[: places_of(data, 5)[0]]
+
+
+def attachment(data: bytes) -> bytes:
+    name = text_of(b"calibration.yaml") + text_of(b"text")
+    return record_of(9, bytes(16) + name + struct.pack("<Q", len(data)) + data + bytes(4))
+
+
+ZEROS = bytes(15 << 20)
+LIMIT = 16 << 20
+BROKEN_CHUNKS: dict[str, tuple[bytes, str]] = {
+    "more than it says": (chunk(b"zstd", ZEROS, 1000), "length and check are right"),
+    "less than it says": (chunk(b"zstd", bytes(9), LIMIT), "length and check are right"),
+    "too large": (chunk(b"zstd", bytes(LIMIT + 1)), f"at most {LIMIT} bytes, got one of {LIMIT + 1}"),
+    "no zstd": (chunk(b"zstd", b"").replace(b"\x28\xb5\x2f\xfd", b"\x28\xb5\x2f\xfe"), "unpacks"),
+    "no lz4": (chunk(b"lz4", b"").replace(b"\x04\x22\x4d\x18", b"\x04\x22\x4d\x19"), "unpacks"),
+    "rar": (chunk(b"rar", ZEROS[:9]), "unknown compression 'rar'"),
+    "a chunk": (chunk(b"zstd", chunk(b"zstd", ZEROS)), "no chunk inside of a chunk"),
+    "an attachment": (chunk(b"zstd", attachment(ZEROS)), "no attachment inside of a chunk"),
+    "a large message": (chunk(b"lz4", message(1, ZEROS)), "expected a record, got kind 5"),
+    "a large channel": (chunk(b"zstd", channel(9, ZEROS)), "expected a record, got kind 4"),
+    "many channels": (
+        chunk(b"zstd", b"".join(channel(100 + k, bytes(1 << 19)) for k in range(20))),
+        "channels of at most 1048576 bytes in all",
+    ),
+    "another channel": (chunk(b"", channel(1, b"other")), "channel 1 as before, got another one"),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN_CHUNKS)
+def test_a_chunk_that_is_broken_or_holds_what_it_must_not_is_refused_with_its_place(
+    recorded: Path, tmp_path: Path, name: str
+) -> None:
+    head, path = beginning(recorded), tmp_path / "bad.mcap"
+    bad, expected = BROKEN_CHUNKS[name]
+    path.write_bytes(head + bad)
+    for read in (lambda: list(Recording(path).arrivals()), lambda: pack(path, tmp_path / "packed.mcap")):
+        with pytest.raises(InputError, match=rf"at byte \d+: .*{expected}") as caught:
+            read()
+        place = int(re.findall(r"at byte (\d+)", str(caught.value))[0])
+        assert place >= len(head)
+
+
+BOMBS: dict[str, bytes] = {
+    "small reads": chunk(b"zstd", message(1, bytes(40)) * (LIMIT // 71)) * 20,
+    "reads": chunk(b"lz4", message(1, ZEROS[: 1 << 20]) * 15) * 20,
+    "large read": chunk(b"zstd", message(1, ZEROS)),
+    "channels": b"".join(chunk(b"zstd", channel(100 + k, ZEROS)) for k in range(20)),
+}
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_a_recording_of_any_number_of_chunks_takes_little_memory(
+    recorded: Path, tmp_path: Path, name: str
+) -> None:
+    path = tmp_path / "bomb.mcap"
+    path.write_bytes(beginning(recorded) + BOMBS[name])
+    tracemalloc.start()
+    with suppress(InputError):
+        for _ in Recording(path).reads():
+            pass
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 64 << 20, f"{peak} bytes of memory"  # what `Recording` promises
+
+
+@pytest.mark.parametrize("profile", ["imu50-rs422", "imu50-can"])
+def test_a_profile_for_the_other_kind_of_line_is_refused_in_plain_words(
+    recorded: Path, tmp_path: Path, profile: str
+) -> None:
+    path, expected = recorded, "CAN messages for imu50-can, got a recording of bytes of a serial line"
+    if profile == "imu50-rs422":
+        path = tmp_path / "can.mcap"
+        can_recording(path, 4)
+        expected = "bytes of a serial line for imu50-rs422, got a recording of CAN messages"
+    with pytest.raises(InputError, match=rf"\.mcap: expected {expected}"):
+        list(Recording(path).arrivals(profiles.load(profile).layout()))
+    with pytest.raises(InputError, match=rf"\.mcap: expected {expected}"):
+        list(Capture(path, profile).pulses())
 
 
 def test_an_attachment_that_was_changed_is_reported(recorded: Path, tmp_path: Path) -> None:
@@ -210,7 +294,7 @@ def test_an_attachment_that_was_changed_is_reported(recorded: Path, tmp_path: Pa
     with pytest.raises(
         InputError, match=rf"at byte {at}: expected a whole attachment record: its check is wrong"
     ):
-        _ = Recording(path).profile
+        Recording(path)
 
 
 def can_recording(path: Path, reads: int) -> list[Arrival]:
@@ -285,11 +369,10 @@ def test_whatever_is_damaged_it_is_read_or_reported(
         content[data.draw(st.integers(8, len(content) - 1))] = data.draw(st.integers(0, 255))
     path = tmp_path / "bad.mcap"
     path.write_bytes(content)
-    recording = Recording(path)
     for read in (
-        lambda: contents(recording),
-        lambda: recording.profile,
-        lambda: recording.origin,
+        lambda: contents(Recording(path)),
+        lambda: Recording(path).profile,
+        lambda: Recording(path).origin,
         lambda: pack(path, tmp_path / "packed.mcap"),
     ):
         try:

@@ -57,6 +57,17 @@ def pulses(counter: ArrayLike) -> NDArray[np.float64]:
     return np.rint(100.0 * np.sin(np.asarray(counter) / 50.0))
 
 
+WITHOUT_KERNEL = """\
+import sys
+import imudrv.system
+from imudrv.cli import main
+
+imudrv.system.IS_AVAILABLE = False
+sys.exit(main())
+"""
+"""A program that is `imudrv` on a system where kernels cannot call the system."""
+
+
 class Unit:
     """A unit on a pty that keeps its name when it is pulled out and put in again."""
 
@@ -98,14 +109,17 @@ class Unit:
 
 
 class Service:
-    """A running `imudrv run`."""
+    """A running `imudrv run`; `has_kernel`: whether the kernel may serve its port."""
+
+    has_kernel = True
 
     def __init__(
         self, folder: Path, *arguments: object, stdin: int = subprocess.DEVNULL, stdout: int = subprocess.PIPE
     ) -> None:
         self.socket = folder / "status.sock"
+        start = ["-m", "imudrv"] if self.has_kernel else ["-c", WITHOUT_KERNEL]
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "imudrv", "run", *map(str, arguments), "--status", str(self.socket)],
+            [sys.executable, *start, "run", *map(str, arguments), "--status", str(self.socket)],
             cwd=folder,
             stdin=stdin,
             stdout=stdout,
@@ -207,6 +221,12 @@ def simulated(folder: Path, profile: str) -> Iterator[None]:
     finally:
         process.kill()
         process.wait()
+
+
+@pytest.fixture(params=["kernel", "python"], autouse=True)
+def loop(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which loop serves: that of the kernel, or that of Python."""
+    monkeypatch.setattr(Service, "has_kernel", request.param == "kernel")
 
 
 @pytest.fixture

@@ -6,11 +6,11 @@ from time import sleep
 
 import numpy as np
 import pytest
-from realtime import DEADLINE_S
+from realtime import DEADLINE_S, until
 
 from imudrv.calibration import coefficients, write_calibration
+from imudrv.chain import Chain
 from imudrv.errors import InputError
-from imudrv.pipeline import Pipeline
 from imudrv.recording.reader import Recording
 from imudrv.records import Flag, Records
 from imudrv.service.loop import Service
@@ -84,9 +84,9 @@ def test_one_recording_follows_another_between_two_reads_and_nothing_is_lost_bet
 
 def replayed(recording: Recording) -> Records:
     """Increments that the wire of a recording gives."""
-    pipeline = Pipeline(recording.profile, coefficients(NOMINAL), "causal")
-    increments = [pipeline.feed(arrival.data, arrival.t_ns).increments for arrival in recording.arrivals()]
-    return np.concatenate([*increments, pipeline.close().increments])
+    chain = Chain(recording.profile, coefficients(NOMINAL), "causal")
+    increments = [chain.feed(arrival.data, arrival.t_ns).increments for arrival in recording.arrivals()]
+    return np.concatenate([*increments, chain.close().increments])
 
 
 @pytest.mark.parametrize("keeps", [True, False])
@@ -194,5 +194,77 @@ def test_a_request_that_the_end_overtakes_is_cancelled(tmp_path: Path) -> None:
     service.run()
     assert request.cancelled()
     assert service.record(tmp_path / "later.mcap").cancelled()
-    with pytest.raises(InputError, match="cannot read it"):
+    with pytest.raises(InputError, match="expected a file, there is none"):
         Recording(tmp_path / "late.mcap")
+
+
+@pytest.mark.parametrize("happens", ["deleted", "renamed"])
+def test_a_recording_that_is_deleted_or_renamed_is_a_failure_and_a_new_one_is_begun(
+    tmp_path: Path, happens: str
+) -> None:
+    write_calibration(tmp_path / "unit.yaml", NOMINAL)
+    path = tmp_path / "run.mcap"
+    settings = Settings(
+        port="sim://static?speed=20",
+        profile="imu50-rs422",
+        calibration=str(tmp_path / "unit.yaml"),
+        status=str(tmp_path / "socket"),
+        record=str(path),
+        sync_s=0.1,
+    )
+    own, warned = Counted(), list[str]()
+    service = Service(settings, lambda _: None, [own], warn=warned.append)
+
+    def act() -> None:
+        wait_for(own, 500)
+        if happens == "deleted":
+            path.unlink()
+        else:
+            path.rename(tmp_path / "moved.mcap")
+        until(lambda: service.status.recording and not service.status.recording.healthy, "the failure")
+        until(path.exists, "the new recording")
+        wait_for(own, own.samples + 500)
+        service.stop()
+
+    acting = Thread(target=act)
+    acting.start()
+    service.run()
+    acting.join(DEADLINE_S)
+    assert any(f"run.mcap was {happens} while it was written" in line for line in warned)
+    assert service.status.health == "fail"
+    counters = np.concatenate(list(Recording(path).increments()))["counter"]
+    assert (np.diff(counters) == 1).all()
+    assert counters[-1] == own.samples - 1
+    if happens == "renamed":
+        before = np.concatenate(list(Recording(tmp_path / "moved.mcap").increments()))["counter"]
+        np.testing.assert_array_equal(np.concatenate([before, counters]), np.arange(own.samples))
+
+
+def test_a_recording_continues_under_another_name_if_its_own_is_taken(tmp_path: Path) -> None:
+    write_calibration(tmp_path / "unit.yaml", NOMINAL)
+    path = tmp_path / "run.mcap"
+    settings = Settings(
+        port="sim://static?speed=20",
+        profile="imu50-rs422",
+        calibration=str(tmp_path / "unit.yaml"),
+        status=str(tmp_path / "socket"),
+        record=str(path),
+    )
+    own = Counted()
+    service = Service(settings, lambda _: None, [own])
+
+    def act() -> None:
+        wait_for(own, 500)
+        (tmp_path / "other").write_text("of another program")
+        (tmp_path / "other").replace(path)
+        until((tmp_path / "run-2.mcap").exists, "the new recording")
+        wait_for(own, own.samples + 500)
+        service.stop()
+
+    acting = Thread(target=act)
+    acting.start()
+    service.run()
+    acting.join(DEADLINE_S)
+    assert path.read_text() == "of another program"
+    counters = np.concatenate(list(Recording(tmp_path / "run-2.mcap").increments()))["counter"]
+    assert counters[-1] == own.samples - 1

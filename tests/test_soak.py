@@ -28,7 +28,7 @@ def test_every_sample_passes_three_processes_with_the_bits_of_the_offline_comman
 
 
 def test_every_sample_passes_at_20_kHz(tmp_path: Path) -> None:
-    assert failed(soak.loopback(tmp_path, 1.0, speed=20.0)) == []
+    assert failed(soak.loopback(tmp_path, 1.0, rate_hz=20_000)) == []
 
 
 def test_a_scenario_with_faults_has_the_same_counts_offline_live_and_recorded(tmp_path: Path) -> None:
@@ -44,7 +44,7 @@ def test_a_recording_after_kill_9_opens_exports_and_replays_to_the_same_incremen
 
 
 def test_the_service_survives_an_unplug_a_full_disk_and_stuck_or_absent_receivers(tmp_path: Path) -> None:
-    assert failed(soak.disruption(tmp_path, 5.0, speed=20.0)) == []
+    assert failed(soak.disruption(tmp_path, 10.0)) == []
 
 
 def test_all_samples_of_minutes_in_virtual_time_are_counted(tmp_path: Path) -> None:

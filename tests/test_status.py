@@ -4,13 +4,13 @@ import pty
 import subprocess
 import sys
 import tty
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from imudrv.calibration import write_calibration
+from imudrv.cli import main as imudrv
 from imudrv.errors import InputError
 from imudrv.hostclock import now_ns
 from imudrv.profiles import load
@@ -93,14 +93,27 @@ def test_a_status_is_the_same_after_json_and_one_of_another_program_is_refused(t
 
 
 def test_a_status_of_another_version_is_refused(tmp_path: Path) -> None:
-    server = StatusServer(tmp_path / "socket")
-    with ThreadPoolExecutor(1) as pool:
-        answer = pool.submit(ask, tmp_path / "socket")
-        while not answer.done():
-            server.poll(b'{"format": "imu50-status", "version": 2}\n')
-    server.close()
+    server = StatusServer(tmp_path / "socket", lambda: b'{"format": "imu50-status", "version": 2}\n')
+    server.start()
     with pytest.raises(InputError, match=r"socket: expected imu50-status version 1, got b'.*\"version\": 2"):
-        answer.result()
+        ask(tmp_path / "socket")
+    server.close()
+    assert not (tmp_path / "socket").exists()
+
+
+@pytest.mark.parametrize(
+    "change", [{"health": "good"}, {"health": []}, {"reasons": None}, {"reasons": [1]}, {"reasons": "dead"}]
+)
+def test_a_status_without_health_or_reasons_is_refused(
+    change: dict[str, object], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status = {"format": "imu50-status", "version": 1, "health": "ok", "reasons": [], **change}
+    server = StatusServer(tmp_path / "socket", lambda: json.dumps(status).encode())
+    server.start()
+    code = imudrv(["status", "--status", str(server.path)])
+    server.close()
+    assert code == 2
+    assert "expected a status with health and reasons" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("options", [[], ["--json"]])
@@ -109,16 +122,15 @@ def test_the_exit_code_of_the_health_survives_a_reader_that_has_gone(
 ) -> None:
     events = ["one of the many lines of a long status"] * 1000  # more than a buffer holds
     document = {"format": "imu50-status", "version": 1, "health": "fail", "reasons": [], "events": events}
-    server = StatusServer(tmp_path / "socket")
+    server = StatusServer(tmp_path / "socket", lambda: json.dumps(document).encode() + b"\n")
+    server.start()
     reader, writer = os.pipe()
     os.close(reader)  # as `head` does when it has its lines
     command = [sys.executable, "-m", "imudrv", "status", "--status", str(server.path), *options]
     process = subprocess.Popen(command, stdout=writer, stderr=subprocess.PIPE)
     os.close(writer)
-    while process.poll() is None:
-        server.poll(json.dumps(document).encode() + b"\n")
-    server.close()
     _, errors = process.communicate()
+    server.close()
     assert (process.returncode, errors) == (4, b"")
 
 

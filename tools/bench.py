@@ -2,8 +2,9 @@
 """Measure the speed of each stage, compared with what a user would otherwise write.
 
     tools/run python tools/bench.py [--rounds N] [--json]
-    tools/run python tools/bench.py live [--seconds N] [--rounds N] [--json]
+    tools/run python tools/bench.py live|can [--seconds N] [--rounds N] [--json]
     tools/run python tools/bench.py nav [--rounds N] [--json]
+    tools/run python tools/bench.py vh [--rounds N] [--json]
 
 A capture with damaged frames passes all stages, piece by piece, in one process on one core. Absolute figures
 depend on the machine and its load; the ratios are what to look at.
@@ -25,8 +26,9 @@ from typing import Final
 
 import numba
 import numpy as np
-from bench_live import live
+from bench_live import TRANSPORTS, live
 from bench_nav import Measure, nav
+from bench_vh import vh
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
@@ -279,7 +281,7 @@ def show(measures: list[Measure], how: str) -> None:
         column.justify = "right"
     for m in measures:
         ours, theirs = f"{m.per_second / 1e6:.1f}", f"{m.other_per_second / 1e6:.2f}"
-        table.add_row(m.stage, ours, m.other_way, theirs, f"{m.ratio:.1f}")
+        table.add_row(m.stage, ours, m.other_way, theirs, f"{m.ratio:.3g}")
     console.print(table)
     counts = ", ".join(f"{m.samples / 1e6:.1f} M and {m.other_samples / 1e6:.1f} M" for m in measures)
     console.print(f"One core, {how}, best round. Samples, own and alternative: {counts}.")
@@ -287,9 +289,12 @@ def show(measures: list[Measure], how: str) -> None:
 
 def show_live(quantiles: dict[str, dict[str, float]]) -> None:
     """Print a table."""
-    table = Table("latency from unit to receiver", *quantiles["ratio"])
+    table = Table("latency from unit to receiver", *next(iter(quantiles.values())))
     for which, row in quantiles.items():
-        table.add_row(which, *(f"{x:.2f}" if which == "ratio" else f"{x * 1e6:.0f} us" for x in row.values()))
+        units = {name: f"{x:.2f}" if "/" in which else f"{x * 1e6:.0f} us" for name, x in row.items()}
+        if "cpu" in row:
+            units["cpu"] = f"{100 * row['cpu']:.1f} %"
+        table.add_row(which, *units.values())
     Console().print(table)
 
 
@@ -300,24 +305,24 @@ def main() -> None:
     parser.add_argument(
         "what",
         nargs="?",
-        choices=("stages", "live", "nav"),
+        choices=("stages", "live", "can", "nav", "vh"),
         default="stages",
         help="default: stages of the driver",
     )
     parser.add_argument(
         "--rounds",
         type=int,
-        help="default: 12 over 5.4 minutes of samples; live 3 of each; nav 5 over an hour",
+        help="default: 12 over 5.4 minutes of samples; live 3 of each; nav 5 over an hour; vh 40",
     )
     parser.add_argument(
         "--seconds", type=int, default=20, help="duration of a live round (default: %(default)s)"
     )
     options = parser.parse_args()
-    rounds = options.rounds or {"stages": 12, "live": 3, "nav": 5}[options.what]
+    rounds = options.rounds or {"stages": 12, "live": 3, "can": 3, "nav": 5, "vh": 40}[options.what]
     if rounds < 1 or options.seconds < 1:
         parser.error("--rounds, --seconds: expected 1 or more")
-    if options.what == "live":
-        quantiles = live(options.seconds, rounds)
+    if options.what in TRANSPORTS:
+        quantiles = live(TRANSPORTS[options.what], options.seconds, rounds)
         if options.json:
             print(json.dumps({"machine": machine(), "seconds": quantiles}, indent=1))
         else:
@@ -330,6 +335,9 @@ def main() -> None:
         measures, peak_mb = nav(rounds)
         how = f"an hour in the pieces of a capture, a row a second, peak memory {peak_mb:.0f} MB"
         extra = {"peak_mb": peak_mb}
+    elif options.what == "vh":
+        measures = vh(rounds)
+        how = f"200 s of damaged bytes, {1.0 / measures[0].ratio:.2f} times the time of C"
     else:
         measures = throughput(rounds) + decode_of_others(rounds)
     if options.json:

@@ -99,7 +99,8 @@ def rehearse(folder: Path, longest_s: float | None = None, is_stopped: bool = Fa
 
 def check(folder: Path, undisturbed: Path) -> list[str]:
     """Return the faults of a disturbed session."""
-    faults = list(verify(folder).faults)
+    verified = verify(folder)
+    faults = [*verified.faults, *verified.unfinished]
     done: set[str] = set()
     for entry in journal(folder):
         if entry["event"] == "accepted":

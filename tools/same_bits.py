@@ -35,6 +35,7 @@ from calib.identification import EstimationOptions, PriorCalibration, identify
 from calib.validation.navigate import navigate
 from calib.validation.trial import TrialSettings
 from imudrv.calibration import Calibration, coefficients
+from imudrv.chain import Chain
 from imudrv.files.settings_file import parse
 from imudrv.imu.coefficients import Coefficients
 from imudrv.imu.compensation import Compensator
@@ -42,7 +43,6 @@ from imudrv.imu.rate_filter import NAMES
 from imudrv.imu.sequence import SequenceTracker
 from imudrv.nav.alignment import Alignment
 from imudrv.nav.mechanisation import Navigator
-from imudrv.pipeline import Pipeline
 from imudrv.profiles import OWN, load
 from imudrv.profiles.schema import Profile
 from imudrv.records import Records
@@ -215,7 +215,7 @@ def compensated(profile: Profile, pulses: Records, c: Coefficients, filter_name:
 def live(profile: Profile, run: Scenario) -> Results:
     """Feed bursts that arrive with random delays, on a host whose clock gains 20 ppm."""
     rng, layout = np.random.default_rng(6), profile.layout()
-    pipeline = Pipeline(profile, coefficients(WHOLE), "centred")
+    chain = Chain(profile, coefficients(WHOLE), "centred")
     outputs, now = [], 0
     for piece in wire(run, layout):
         sent, begin, i = piece.t_ns + piece.t_ns // 50_000 + 10**18, 0, 0
@@ -225,11 +225,11 @@ def live(profile: Profile, run: Scenario) -> Results:
             i = min(i + int(rng.integers(1, 9)), len(sent))
             end, late = int(piece.end[i - 1]), 5e7 if rng.random() < 1e-3 else rng.exponential(1e5)
             now = max(now, int(sent[i - 1]) + int(late))
-            outputs.append(pipeline.feed(piece.data[begin:end], now))
+            outputs.append(chain.feed(piece.data[begin:end], now))
             begin = end
-    outputs.append(pipeline.close())
-    pulses, increments = (np.concatenate(parts) for parts in zip(*outputs, strict=True))
-    yield "stamp", sha256(pulses, increments, pipeline.clock.report)
+    outputs.append(chain.close())
+    pulses, increments = (np.concatenate(parts) for parts in zip(*(o[:2] for o in outputs), strict=True))
+    yield "stamp", sha256(pulses, increments, chain.clock.report)
 
 
 def identified() -> Results:

@@ -7,24 +7,24 @@ from calib.bench.result import Result, identify_session
 from calib.bench.screen import OperatorScreen
 from calib.bench.session import Session
 from calib.bench.state import REPORT, RESULT
-from calib.certificate import write
+from calib.certificate import check_target, write
 from calib.lever_arms.gauge import convert
 from calib.reports.identification import arms_text, report_html
 from calib.reports.verdict import verdict
-from imudrv.calibration import Calibration, read_calibration, write_calibration
+from imudrv.calibration import Calibration, read_calibration
 from imudrv.errors import InputError
-from imudrv.files import atomic
+from imudrv.files import atomic, settings_file
 from imudrv.files.atomic import atomic_write
 
 
 def session_result(session: Session) -> Result:
     """Return the result of the recordings; its certificate is written once and then read back."""
     result = identify_session(session)
-    path = session.folder / RESULT
+    path = session.path(RESULT)
     if RESULT in session.files:
         return result._replace(certificate=read_calibration(path))
     path.unlink(missing_ok=True)  # of a process that was killed before it recorded the file
-    write_calibration(path, result.certificate)
+    write(path, result.certificate, session.key)
     session.record_file(RESULT)
     return result
 
@@ -74,17 +74,25 @@ def summary(result: Result) -> str:
 
 
 def activate(session: Session, certificate: Calibration) -> None:
-    """Make a certificate the active one, unless it is already.
+    """Make the result the active certificate, unless it is already.
+
+    Parameters
+    ----------
+    session : Session
+        The session.
+    certificate : Calibration
+        Its result.
 
     Raises
     ------
     InputError
-        The active certificate is neither the initial one nor the result.
+        The active certificate is neither the initial one nor the result, or that of another unit.
     """
     active = session.plan.certificate
     digest = atomic.sha256(active.path)
     if digest == active.sha256:
-        write(active.path, certificate)
+        check_target(active.path, certificate)
+        settings_file.replace(active.path, atomic.content(session.path(RESULT)))
     elif digest != session.files[RESULT]:
         raise InputError(
             f"{active.path}: expected the certificate that the session began with, it was changed meanwhile; "
@@ -100,6 +108,6 @@ def write_report(session: Session, result: Result, residual: ResidualVelocity | 
     if residual is not None:
         text = f"One more rotation with the new certificate: {residual}."
     section = f"<section>\n<h2>Verification</h2>\n<p>{text}</p>\n</section>"
-    with atomic_write(session.folder / REPORT) as file:
+    with atomic_write(session.path(REPORT)) as file:
         file.write(html.replace("</section>", f"</section>\n{section}", 1).encode())
     session.record_file(REPORT)

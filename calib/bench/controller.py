@@ -151,9 +151,8 @@ class SessionController:
         residual = None
         if VERIFICATION in last.accepted:
             residual = residual_velocity(session, result.certificate)
-        if session.stage(SessionEnded) is None:
-            write_report(session, result, residual)
-            session.append(SessionEnded(residual))
+        write_report(session, result, residual)
+        session.end(SessionEnded(residual))
         self.outcome = (
             f"active certificate: {session.plan.certificate.path}\n"
             f"verification: {residual or 'skipped'}\n"
@@ -170,7 +169,10 @@ class SessionController:
             else:
                 unit = self._session.plan.unit
                 decision = Decision(ask_operator(unit, self._screen, self._keys, self._queue))
-            self._session.append(decision)
+            if decision.accepted:
+                self._session.append(decision)
+        if not decision.accepted:
+            self._session.end(decision)
         return decision.accepted
 
     def _run_steps(self, procedure: Procedure) -> Finished | Aborted:

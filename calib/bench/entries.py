@@ -1,16 +1,17 @@
-"""Entries of the journal: one dataclass per event, and their JSON form.
+"""Entries of the journal: one dataclass per event; their JSON form is checked as a settings file is.
 
 Events of the procedure's engine are journaled as they are, an accepted step with its recording.
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import MISSING, asdict, dataclass, fields
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, Final, Literal, Self, TypeAlias, get_args
+from typing import Annotated, Any, Final, Literal, Self, TypeAlias, get_args, get_type_hints
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import AfterValidator, AwareDatetime, TypeAdapter, create_model
+from pydantic import Field as Key
 
 from calib.messages import verbatim
 from calib.procedure.events import (
@@ -18,6 +19,7 @@ from calib.procedure.events import (
     Accepted,
     Checked,
     Entered,
+    Event,
     Finished,
     Redone,
     Rejected,
@@ -25,8 +27,45 @@ from calib.procedure.events import (
     Skipped,
     Turned,
 )
-from imudrv.errors import InputError
+from imudrv.calibration import Base64Of32Bytes, Base64Of64Bytes, SerialNumber
+from imudrv.errors import FaultyFileError
+from imudrv.files import settings_file
+from imudrv.files.faults import shown_value
+from imudrv.files.model import Model
 from imudrv.units import MM
+
+MAX_COUNTER: Final = 1 << 53
+"""Largest counter: exact in every JSON reader, and 285 000 years at 1 kHz."""
+
+
+def _printable(text: str) -> str:
+    if not text.isprintable():
+        raise ValueError(f"expected printable text, got {text[:60]!r}")
+    return text
+
+
+def _file_name(text: str) -> str:
+    if not text.isprintable() or "/" in text or text in ("", ".", ".."):
+        raise ValueError(f"expected the name of a file in the session's folder, got {text[:60]!r}")
+    return text
+
+
+def _absolute(path: Path) -> Path:
+    if not path.is_absolute() or not str(path).isprintable():
+        raise ValueError(f"expected an absolute path of printable text, got {str(path)[:60]!r}")
+    return path
+
+
+Counter = Annotated[int, Key(ge=-1, le=MAX_COUNTER)]
+"""Counter of a sample; -1: before the first."""
+Count = Annotated[int, Key(ge=0, le=MAX_COUNTER)]
+Digest = Annotated[str, Key(pattern=r"^[0-9a-f]{64}$")]
+"""SHA-256, hexadecimal."""
+Line = Annotated[str, Key(max_length=4096), AfterValidator(_printable)]
+"""Text that is printed in messages."""
+FileName = Annotated[str, Key(max_length=255), AfterValidator(_file_name)]
+"""Name of a file in the session's folder; no path."""
+AbsolutePath = Annotated[Path, AfterValidator(_absolute)]
 
 
 @dataclass(frozen=True)
@@ -43,9 +82,9 @@ class EmbeddedFile:
         SHA-256 of the content, hexadecimal.
     """
 
-    name: str
+    name: Line
     text: str
-    sha256: str
+    sha256: Digest
 
     @classmethod
     def of(cls, name: str | Path, content: bytes) -> Self:
@@ -57,8 +96,18 @@ class EmbeddedFile:
 class CertificateFile:
     """The unit's active certificate: its path, and its SHA-256 when the session began."""
 
-    path: Path
-    sha256: str
+    path: AbsolutePath
+    sha256: Digest
+
+
+def _undamaged(file: EmbeddedFile) -> EmbeddedFile:
+    found = sha256(file.text.encode()).hexdigest()
+    if found != file.sha256:
+        raise ValueError(f"expected text of the SHA-256 {file.sha256[:12]}..., got {found[:12]}...")
+    return file
+
+
+UndamagedFile = Annotated[EmbeddedFile, AfterValidator(_undamaged)]
 
 
 @dataclass(frozen=True)
@@ -83,22 +132,22 @@ class Plan:
 
     format: Literal["imu50-session"]
     version: Literal[1]
-    software: str
-    unit: str
-    port: str
+    software: Line
+    unit: SerialNumber
+    port: Line
     certificate: CertificateFile
-    procedure: EmbeddedFile
-    site: EmbeddedFile
-    profile: EmbeddedFile
+    procedure: UndamagedFile
+    site: UndamagedFile
+    profile: UndamagedFile
 
 
 @dataclass(frozen=True)
 class FileRecorded:
     """A complete file of the session; `left` if it belongs to an attempt that a kill or power cut ended."""
 
-    name: str
-    bytes: int
-    sha256_of_file: str
+    name: FileName
+    bytes: Count
+    sha256_of_file: Digest
     left: bool = False
 
 
@@ -106,8 +155,17 @@ class FileRecorded:
 class AcceptedStep(Accepted):
     """An accepted attempt whose files are recorded; temperatures in degrees Celsius by channel."""
 
-    recording: str
-    temperature_degc: Mapping[str, float | None]
+    recording: FileName
+    temperature_degc: Mapping[Line, float | None]
+
+    def __post_init__(self) -> None:
+        """Refuse counters in the wrong order, and more samples than they span."""
+        first, last = self.first_counter, self.last_counter
+        span = last - first + 1
+        if span < 1:
+            raise ValueError(f"last_counter: expected at least first_counter, {first}, got {last}")
+        if self.samples is not None and self.samples > span:
+            raise ValueError(f"samples: expected at most the {span} of the counters, got {self.samples}")
 
 
 @dataclass(frozen=True)
@@ -121,9 +179,9 @@ class ServiceMessage:
 class UnitDetected:
     """First data from the unit in this process; `restarted` if its counter is behind the journal's."""
 
-    counter: int
+    counter: Counter
     restarted: bool
-    temperature_degc: Mapping[str, float | None]
+    temperature_degc: Mapping[Line, float | None]
 
 
 @dataclass(frozen=True)
@@ -165,15 +223,23 @@ class SessionEnded:
 class Resumed:
     """The session was opened again; `left` names the files of an interrupted attempt."""
 
-    left: tuple[str, ...]
+    left: tuple[FileName, ...]
 
 
 @dataclass(frozen=True)
 class LineDropped:
     """A partial last line was dropped from the journal."""
 
-    bytes: int
-    sha256_of_dropped: str
+    bytes: Count
+    sha256_of_dropped: Digest
+
+
+@dataclass(frozen=True)
+class Signed:
+    """Signature of the journal up to the line before; see `calib.bench.journal`."""
+
+    public_key: Base64Of32Bytes
+    ed25519: Base64Of64Bytes
 
 
 Counted: TypeAlias = (
@@ -192,6 +258,7 @@ Entry: TypeAlias = (
     | SessionEnded
     | Resumed
     | LineDropped
+    | Signed
 )
 
 
@@ -212,19 +279,41 @@ _NAMES: Final = {kind: _SPECIAL_NAMES.get(kind, kind.__name__.lower()) for kind 
 _KINDS: Final = {name: kind for kind, name in _NAMES.items()}
 
 
+_OF_ENGINE: Final[Mapping[str, Any]] = {
+    "step_id": Annotated[str, Key(max_length=64), AfterValidator(_printable)],
+    "attempt": Annotated[int, Key(ge=0, le=1_000_000)],
+    "counter": Counter,
+    "first_counter": Count,
+    "last_counter": Count,
+    "samples": Annotated[int, Key(ge=1, le=MAX_COUNTER)] | None,
+}
+"""Limits of fields of the engine's events."""
+
+
+class _Line(Model):
+    """What every line of a journal has; see `calib.bench.journal`."""
+
+    event: str
+    at: AwareDatetime | None = None
+    before: Digest | Literal[""] = ""
+    sha256: Digest | None = None
+
+
 def to_json(entry: Entry) -> dict[str, Any]:
     """Return an entry as a JSON object; its `event` names the dataclass."""
     event = _NAMES[type(entry)]
     return {"event": event, **_adapter(event).dump_python(entry, mode="json")}
 
 
-def from_json(line: Mapping[str, Any]) -> Entry:
-    """Return the entry of a JSON object; keys that its dataclass does not have are ignored.
+def from_json(line: object, name: str = "journal") -> Entry:
+    """Check the JSON object of a line and return its entry.
 
     Parameters
     ----------
-    line : mapping
-        As `to_json` or an older version made it.
+    line : object
+        As `to_json` or an older version made it, with or without the keys of the journal.
+    name : str
+        Name of the line in messages.
 
     Returns
     -------
@@ -232,26 +321,45 @@ def from_json(line: Mapping[str, Any]) -> Entry:
 
     Raises
     ------
-    InputError
-        The event is unknown, or a field is missing or invalid.
+    FaultyFileError
+        The event is unknown, or keys are missing, unknown or invalid; all faults at once.
     """
+    if not isinstance(line, dict):
+        raise FaultyFileError(name, ["expected a JSON object"])
     event = line.get("event")
-    if event not in _KINDS:
-        raise InputError(f"unknown event {event!r}; a newer version may have written it")
+    if not isinstance(event, str) or event not in _KINDS:
+        known = ", ".join(sorted(_KINDS))
+        raise FaultyFileError(
+            name,
+            [f"event: expected one of {known}, got {shown_value(event)}; is it of a newer version?"],
+        )
     if "reason" in line:  # in older journals a restart has one, and reasons are texts
-        line = {**line, "reasons": [line["reason"]]}
-    if "reasons" in line:
-        reasons = [asdict(verbatim(r)) if isinstance(r, str) else r for r in line["reasons"]]
-        line = {**line, "reasons": reasons}
+        line = {"reasons": [line["reason"]], **{key: line[key] for key in line if key != "reason"}}
+    if isinstance(reasons := line.get("reasons"), list):
+        line = {**line, "reasons": [asdict(verbatim(r)) if isinstance(r, str) else r for r in reasons]}
+    checked = settings_file.parse(line, _model(event), name)
+    kind = _KINDS[event]
     try:
-        entry: Entry = _adapter(event).validate_python(line)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"]))
-        raise InputError(f"event {event!r}: field {where}: {first['msg']}") from None
+        entry: Entry = kind(**{field.name: getattr(checked, field.name) for field in fields(kind)})
+    except ValueError as error:
+        raise FaultyFileError(name, [str(error)]) from None
     return entry
 
 
 @cache
 def _adapter(event: str) -> TypeAdapter[Any]:
     return TypeAdapter(_KINDS[event])
+
+
+@cache
+def _model(event: str) -> type[Model]:
+    """Return the model of a line with an event."""
+    kind = _KINDS[event]
+    types = get_type_hints(kind, include_extras=True)
+    if issubclass(kind, Event):
+        types.update(_OF_ENGINE)
+    keys: dict[str, Any] = {
+        field.name: (types[field.name], ... if field.default is MISSING else field.default)
+        for field in fields(kind)
+    }
+    return create_model(kind.__name__, __base__=_Line, **keys)

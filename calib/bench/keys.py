@@ -3,13 +3,18 @@
 import os
 import select
 import sys
-import termios
-import tty
 from collections.abc import Callable
+from contextlib import suppress
+from queue import Empty, SimpleQueue
+from threading import Thread
 from types import TracebackType
 from typing import Any, Final, Self
 
 from calib.procedure.events import Abort, Action, Confirm, Redo, Skip, View
+from imudrv.posix import termios, tty
+
+BY_LINES: Final = termios is None
+"""Whether the system delivers keys only line by line, each after Enter."""
 
 _ACTIONS: Final = {"\n": "confirm", "\r": "confirm", "r": "redo", "s": "skip", "q": "abort"}
 
@@ -35,9 +40,12 @@ class Keyboard:
         self.asks = False
         self._fd = sys.stdin.fileno() if self.there else -1
         self._before: Any = None
+        self._typed: SimpleQueue[str] = SimpleQueue()
 
     def __enter__(self) -> Self:
-        if self.there:
+        if self.there and BY_LINES:
+            Thread(target=self._read_lines, name="keyboard", daemon=True).start()
+        elif self.there:
             self._before = termios.tcgetattr(self._fd)
             tty.setcbreak(self._fd)
         return self
@@ -45,11 +53,17 @@ class Keyboard:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
     ) -> None:
-        if self.there:
+        if self.there and not BY_LINES:
             termios.tcsetattr(self._fd, termios.TCSADRAIN, self._before)
 
     def read(self) -> str:
         """Return the keys typed since the last call; escape sequences are ignored."""
+        if BY_LINES:
+            keys = ""
+            with suppress(Empty):
+                while True:
+                    keys += self._typed.get_nowait()
+            return keys
         if not self.there or not select.select([self._fd], [], [], 0.0)[0]:
             return ""
         typed = os.read(self._fd, 1024).decode(errors="replace")
@@ -79,3 +93,7 @@ class Keyboard:
                 continue
             return _BY_STEP[name](view.step_id)
         return None
+
+    def _read_lines(self) -> None:
+        while line := os.read(self._fd, 1024):
+            self._typed.put(line.decode(errors="replace").strip().lower() or "\n")

@@ -36,6 +36,8 @@ class QueueSink(Sink):
         Whether the service has ended; waiting items can still be taken.
     """
 
+    is_patient = True
+
     def __init__(self, most: int | None) -> None:
         super().__init__("bench")
         self._most = most

@@ -128,9 +128,11 @@ def resume(session: Session, console: Console, redo: Sequence[str], *, asks: boo
     """
     lines = [session.dropped] if session.dropped else []
     accepted = ", ".join(session.accepted) or "none yet"
-    lines.append(f"session {session.folder} of unit {session.plan.unit}: accepted steps: {accepted}")
+    plan = session.plan
+    lines.append(f"session {session.folder} of unit {plan.unit}: accepted steps: {accepted}")
+    lines.append(f"port {plan.port}, active certificate {plan.certificate.path}")
     console.print("\n".join(lines), markup=False, soft_wrap=True)
-    if asks and console.input("resume it? \\[y/n] ").strip().lower() not in ("y", "yes"):
+    if asks and console.input("resume it? [y/n] ", markup=False).strip().lower() not in ("y", "yes"):
         raise InputError(f"{session.folder}: not resumed and not changed; name another folder to begin anew")
     session.redo(redo)
     session.append(Resumed(session.record_leftovers()))

@@ -1,13 +1,12 @@
 """`calib run`: a session from the command line, with a unit or a rehearsal."""
 
 import os
-import tempfile
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from signal import SIGHUP, SIGINT, SIGTERM
+from signal import SIGINT, SIGTERM
 from threading import Thread
 from typing import Final
 
@@ -34,9 +33,11 @@ from imudrv.calibration import coefficients, read_calibration
 from imudrv.errors import InputError
 from imudrv.files import settings_file
 from imudrv.imu.compensation import require_sensors
+from imudrv.service.endpoint import default_folder
 from imudrv.service.loop import Service
 from imudrv.service.runtime import SignalFlags
 from imudrv.service.settings import Settings
+from imudrv.signals import SIGHUP
 from imudrv.sinks.history import History
 from imudrv.site import Site
 from imudrv.terminal import INTERRUPTED, OK
@@ -157,13 +158,14 @@ def conduct(session: Session, options: RunOptions, console: Console) -> int:
     begun_with = session.plan
     simulated = SimulatedUnitProcess(session.folder, options.speed) if options.is_rehearsal else None
     queue = QueueSink(QUEUE_LIMIT if simulated is not None and simulated.waits else None)
-    layout = profiles.load(begun_with.profile.name).layout()
+    profile = session.profile()
+    layout = profiles.load(profile).layout()
     settings = Settings(
-        port=options.port or begun_with.port,
-        profile=begun_with.profile.name,
+        port=options.port or (begun_with.port if simulated is None else simulated.port),
+        profile=profile,
         calibration=str(session.folder / WORKING_CERTIFICATE),
         unit=begun_with.unit,
-        status=str(Path(tempfile.gettempdir()) / f"imu50-calib-{os.getpid()}.sock"),
+        status=str(default_folder() / f"imu50-calib-{os.getpid()}.sock"),
     )
     signals = SignalFlags()
     service = Service(
@@ -177,7 +179,7 @@ def conduct(session: Session, options: RunOptions, console: Console) -> int:
 
     def begin(steps: Procedure) -> None:
         if simulated is not None:
-            simulated.begin(steps, begun_with.profile.name)
+            simulated.begin(steps, profile)
 
     controller = SessionController(
         session,
@@ -283,5 +285,5 @@ def _require_resumable(session: Session, options: RunOptions) -> None:
         procedure=EmbeddedFile.of(procedure, plan.load_file(procedure).content) if procedure else None,
         calibration=options.calibration,
         site=EmbeddedFile.of(site, settings_file.read_file(site, Site).content) if site else None,
-        profile=options.profile or session.plan.profile.name,
+        profile=options.profile or session.profile(),
     )

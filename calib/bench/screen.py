@@ -16,6 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from calib.bench import block_letters
+from calib.bench.keys import BY_LINES
 from calib.messages import english, message, verbatim
 from calib.procedure.events import Phase, View
 from imudrv.diagnosis import LineState
@@ -305,4 +306,5 @@ def _bar(part: float | None, width: int, style: str, ascii_only: bool) -> Text:
 
 
 def _keys(actions: Sequence[str]) -> str:
-    return "   ".join(f"{_NAMES[name]}: {name}" for name in _NAMES if name in actions)
+    names = [f"{_NAMES[name]}: {name}" for name in _NAMES if name in actions]
+    return "   ".join([*names, "(a letter, then Enter)"] if names and BY_LINES else names)

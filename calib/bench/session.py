@@ -4,16 +4,17 @@
 ``journal.jsonl``     see `calib.bench.journal`; its first line is the plan
 ``before.yaml``       the unit's certificate at the beginning
 ``working.yaml``      the same without size effect and skew: the service compensates with it
+``profile.yaml``      the plan's profile for the service, unless it is a shipped one
 ``run-STEP-N.mcap``   recording of the N-th attempt at a step, and ``run-STEP-N.npz`` its velocity and H
 ``certificate.yaml``  the result, and ``report.html``
 ====================  ===================================================================================
 
 The SHA-256 of each file is written to the journal once the file is closed. A step is accepted only when its
 files are recorded there and its recording has been decoded and found to cover the attempt. The
-result can therefore always be computed again from the files.
+result can therefore always be computed again from the files. A bench with a key signs the certificate and the
+end of the journal.
 """
 
-import fcntl
 import hashlib
 import os
 from collections.abc import Sequence
@@ -22,22 +23,33 @@ from pathlib import Path
 from typing import Self
 
 from calib.bench import journal
-from calib.bench.entries import CertificateFile, Decision, EmbeddedFile, Entry, FileRecorded, Plan
+from calib.bench.entries import (
+    CertificateFile,
+    Decision,
+    EmbeddedFile,
+    Entry,
+    FileRecorded,
+    Plan,
+    SessionEnded,
+)
 from calib.bench.journal import Journal
 from calib.bench.state import (
     INITIAL_CERTIFICATE,
     JOURNAL,
     LOCK,
+    PROFILE,
     WORKING_CERTIFICATE,
     SessionState,
     require_session,
 )
 from calib.procedure.events import Redone
 from calib.procedure.schema import VERIFICATION
+from calib.signing.keys import BenchKey, bench_key
 from imudrv import profiles
 from imudrv.calibration import Calibration, read_calibration, read_calibration_file, write_calibration
 from imudrv.errors import InputError
-from imudrv.files.atomic import sync_folder
+from imudrv.files.atomic import atomic_write, sync_folder
+from imudrv.files.lock import FileLock
 
 
 class Session(SessionState):
@@ -49,12 +61,14 @@ class Session(SessionState):
         Its folder.
     plan : Plan
         First entry of its journal.
+    key : BenchKey or None
+        Key of the bench, which signs the result; None if it has none.
     dropped : str
         Message about a partial line that was dropped from the journal; empty if there was none.
     """
 
-    def __init__(self, folder: Path, lock: int) -> None:
-        self._lock = lock
+    def __init__(self, folder: Path, lock: FileLock, key: BenchKey | None) -> None:
+        self._lock, self.key = lock, key
         self._journal = Journal(folder / JOURNAL)
         super().__init__(folder, self._journal.entries)
         self.dropped = self._journal.dropped
@@ -95,8 +109,9 @@ class Session(SessionState):
         Raises
         ------
         InputError
-            The folder contains a session, or the folder or the certificate cannot be used.
+            The folder contains a session; or the folder, the certificate or the bench's key cannot be used.
         """
+        key = bench_key()
         before = read_calibration_file(calibration)
         plan = Plan(
             format="imu50-session",
@@ -123,9 +138,9 @@ class Session(SessionState):
             working = before.model.without_size_effect().without_skew()  # both are estimated
             write_calibration(folder / WORKING_CERTIFICATE, working)
             journal.begin(folder / JOURNAL, plan)
-            return cls(folder, lock)
+            return cls(folder, lock, key)
         except BaseException:
-            os.close(lock)
+            lock.release()
             raise
 
     @classmethod
@@ -144,21 +159,25 @@ class Session(SessionState):
         Raises
         ------
         InputError
-            The folder contains no session, another process has it open, or the journal is damaged; the
-            message gives the line.
+            The folder contains no session, another process has it open, the journal is damaged (the message
+            gives the line), or the bench's key cannot be used.
         """
-        folder = Path(folder)
+        folder, key = Path(folder), bench_key()
         require_session(folder)
         lock = _locked(folder)
         try:
-            return cls(folder, lock)
+            return cls(folder, lock, key)
         except BaseException:
-            os.close(lock)
+            lock.release()
             raise
 
     def append(self, entry: Entry) -> None:
         """Append an entry to the journal; see `Journal.append`."""
         self._journal.append(entry)
+
+    def end(self, entry: Decision | SessionEnded) -> None:
+        """Append the last entry, and the signature of the journal if the bench has a key."""
+        self._journal.append(entry, self.key)
 
     def record_file(self, name: str, *, left: bool = False) -> None:
         """Write the hash of a complete file to the journal.
@@ -225,18 +244,35 @@ class Session(SessionState):
         """Return the certificate with which the service compensates."""
         return read_calibration(self.folder / WORKING_CERTIFICATE)
 
+    def profile(self) -> str:
+        """Return the profile with which the service decodes: a shipped one by its name, else the plan's text.
+
+        A path that somebody wrote into the journal is not opened.
+
+        Raises
+        ------
+        InputError
+            The text cannot be written to its file in the folder.
+        """
+        profile = self.plan.profile
+        if profile.name in profiles.shipped():
+            return profile.name
+        path = self.path(PROFILE)
+        with atomic_write(path) as file:
+            file.write(profile.text.encode())
+        return str(path)
+
     def close(self) -> None:
         """Close the journal and release the lock."""
         self._journal.close()
-        os.close(self._lock)
+        self._lock.release()
 
 
-def _locked(folder: Path) -> int:
+def _locked(folder: Path) -> FileLock:
     """Take the folder's lock, which ends with the process."""
-    lock = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        os.close(lock)
+        return FileLock(folder / LOCK)
+    except BlockingIOError:
         raise InputError(f"{folder}: another process has this session open; end it first") from None
-    return lock
+    except OSError as error:
+        raise InputError(f"{folder / LOCK}: cannot be opened: {error.strerror or error}") from error

@@ -1,10 +1,10 @@
 """Simulated unit and certificate of a rehearsal."""
 
-import os
+import socket
 import subprocess
 import sys
-import time
 from pathlib import Path
+from threading import Timer
 from typing import Final
 
 from calib.bench.technician import BENCH, technician_scenario, true_calibration
@@ -15,6 +15,8 @@ from imudrv import profiles
 from imudrv.calibration import write_calibration
 from imudrv.errors import InputError
 from imudrv.files import settings_file
+from imudrv.loopback import LOOPBACK
+from imudrv.posix import termios
 from imudrv.sim.scenario import nominal
 from imudrv.url import speed_of
 from imudrv.wire.layout import Layout
@@ -29,13 +31,17 @@ _FOLDER: Final = "rehearsal"
 _START_TIMEOUT_S: Final = 60.0
 
 
-# The unit ends with its parent process, even when that is killed (Linux: PR_SET_PDEATHSIG, SIGKILL), and does
-# not start if the parent has already ended.
+# The unit ends with its parent process, even when that is killed: its standard input then ends.
 _UNIT: Final = (
-    "import ctypes, os, sys; ctypes.CDLL(None).prctl(1, 9); "
-    "os.getppid() == int(sys.argv.pop(1)) or sys.exit(); "
+    "import os, sys, threading; "
+    "threading.Thread(target=lambda: os.read(0, 1) or os._exit(0), daemon=True).start(); "
     "from imudrv.cli import main; sys.exit(main())"
 )
+
+
+def _free_port() -> int:
+    with socket.create_server((LOOPBACK, 0)) as server:
+        return int(server.getsockname()[1])
 
 
 def is_rehearsal(folder: Path) -> bool:
@@ -44,7 +50,7 @@ def is_rehearsal(folder: Path) -> bool:
 
 
 class SimulatedUnitProcess:
-    """Process with a simulated unit, moved by a simulated technician, on a pty.
+    """Process with a simulated unit, moved by a simulated technician, on a pty, or on TCP if there are none.
 
     Parameters
     ----------
@@ -57,6 +63,11 @@ class SimulatedUnitProcess:
     ------
     InputError
         The speed is invalid.
+
+    Attributes
+    ----------
+    port : str
+        Port of the unit, for the driver.
     """
 
     def __init__(self, folder: Path, speed: str) -> None:
@@ -64,6 +75,11 @@ class SimulatedUnitProcess:
         self._speed = speed
         self.waits = speed_of(speed) is None
         self._unit: subprocess.Popen[str] | None = None
+        if termios is not None:
+            self.port, self._target = str(self._link), ["--port", "pty", "--link", str(self._link)]
+        else:
+            address = f"{LOOPBACK}:{_free_port()}"
+            self.port, self._target = f"socket://{address}", ["--port", f"tcp://{address}"]
 
     def make(self, layout: Layout) -> tuple[str, Path, Path]:
         """Write the unit's certificate and site.
@@ -87,7 +103,7 @@ class SimulatedUnitProcess:
         certificate, site = self._folder / "unit.yaml", self._folder / "site.yaml"
         write_calibration(certificate, unit.model_copy(update={"size_effect": None}))
         settings_file.write(site, BENCH)
-        return str(self._link), certificate, site
+        return self.port, certificate, site
 
     def truth(self, layout: Layout) -> LeverArms:
         """Return the true lever arms of the unit, to compare the result with at the end."""
@@ -112,26 +128,27 @@ class SimulatedUnitProcess:
         scenario = self._folder / "scenario.yaml"
         sends = nominal(profiles.load(profile).layout())
         settings_file.write(scenario, technician_scenario(procedure, seed=SEED, unit=sends))
-        command = ["sim", str(scenario), "--profile", profile, "--port", "pty", "--link", str(self._link)]
+        command = ["sim", str(scenario), "--profile", profile, *self._target, "--speed", self._speed]
         self._unit = unit = subprocess.Popen(
-            [sys.executable, "-c", _UNIT, str(os.getpid()), *command, "--speed", self._speed],
-            stdout=subprocess.DEVNULL,
+            [sys.executable, "-c", _UNIT, *command],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
         )
-        end = time.monotonic() + _START_TIMEOUT_S
-        while not self._link.exists():
-            if unit.poll() is not None or time.monotonic() > end:
-                unit.kill()
-                _, reason = unit.communicate()
-                raise InputError(f"the simulated unit did not start: {reason.strip()}")
-            time.sleep(0.02)
+        limit = Timer(_START_TIMEOUT_S, unit.kill)
+        limit.start()
+        is_there = unit.stdout is not None and unit.stdout.readline()  # "... plays on PORT"
+        limit.cancel()
+        if not is_there:
+            _, reason = unit.communicate()
+            raise InputError(f"the simulated unit did not start: {reason.strip()}")
 
     def end(self) -> None:
         """End the unit's process."""
         if self._unit is not None:
-            self._unit.kill()
-            self._unit.wait()
+            with self._unit:
+                self._unit.kill()
         self._link.unlink(missing_ok=True)
 
     @property

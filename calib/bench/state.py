@@ -1,5 +1,6 @@
 """State of a session, as its journal determines it."""
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, NamedTuple, TypeVar
@@ -12,6 +13,7 @@ from calib.bench.entries import (
     FileRecorded,
     Plan,
     SessionEnded,
+    Signed,
 )
 from calib.identification import PriorCalibration
 from calib.procedure.events import Finished, Redone
@@ -21,6 +23,7 @@ from imudrv.calibration import read_calibration
 from imudrv.errors import InputError
 from imudrv.files import settings_file
 from imudrv.files.model import M
+from imudrv.profiles.schema import Profile
 from imudrv.site import Site
 
 JOURNAL: Final = "journal.jsonl"
@@ -36,6 +39,9 @@ RESULT: Final = "certificate.yaml"
 
 
 REPORT: Final = "report.html"
+
+
+PROFILE: Final = "profile.yaml"
 
 
 LOCK: Final = ".lock"
@@ -84,14 +90,17 @@ class SessionState:
     Raises
     ------
     InputError
-        The journal does not begin with a plan.
+        The journal does not begin with a plan, or a file in the plan has faults.
     """
 
     def __init__(self, folder: Path, entries: Sequence[Entry]) -> None:
         plan = entries[0]
         if not isinstance(plan, Plan):
-            raise InputError(f"{folder / JOURNAL}: line 1: expected the plan of an imu50-session, version 1")
+            raise InputError(f"{folder / JOURNAL}: line 1: expected the plan of an imu50-session")
         self.folder, self.entries, self.plan = folder, entries, plan
+        self._procedure = self._parse("procedure", plan.procedure, Procedure)
+        self._site = self._parse("site", plan.site, Site)
+        self._parse("profile", plan.profile, Profile)
 
     @property
     def files(self) -> dict[str, str]:
@@ -134,42 +143,63 @@ class SessionState:
     @property
     def is_over(self) -> bool:
         """Whether the session is complete, or its result was rejected."""
-        last = self.entries[-1]
+        last = self.entries[-2 if isinstance(self.entries[-1], Signed) else -1]
         return isinstance(last, SessionEnded) or (isinstance(last, Decision) and not last.accepted)
 
     def site(self) -> Site:
         """Return the site of the session."""
-        return _parse(self.plan.site, Site)
+        return self._site
 
     def procedure(self) -> Procedure:
         """Return the procedure of the session."""
-        return _parse(self.plan.procedure, Procedure)
+        return self._procedure
+
+    def path(self, name: str) -> Path:
+        """Return the path of a file of the session.
+
+        Parameters
+        ----------
+        name : str
+            Name in the folder; the journal contains no paths.
+
+        Raises
+        ------
+        InputError
+            It is a symbolic link, which could lead out of the folder.
+        """
+        path = self.folder / name
+        if os.path.islink(path):
+            raise InputError(
+                f"{path}: expected a file in the session's folder, got a symbolic link; copy the file into it"
+            )
+        return path
 
     def initial_calibration(self) -> PriorCalibration:
         """Return the certificate with which the session began."""
         certificate = self.plan.certificate
         return PriorCalibration(
-            read_calibration(self.folder / INITIAL_CERTIFICATE), certificate.path.name, certificate.sha256
+            read_calibration(self.path(INITIAL_CERTIFICATE)), certificate.path.name, certificate.sha256
         )
 
     def attempts(self) -> dict[str, Attempt]:
         """Return the accepted attempts by step id, in the order of the procedure, the verification last."""
         procedure, accepted = self.procedure(), self.accepted
         return {
-            step.id: Attempt(step, self.folder / a.recording, a.first_counter, a.last_counter, a.samples)
+            step.id: Attempt(step, self.path(a.recording), a.first_counter, a.last_counter, a.samples)
             for step in (*procedure.steps, *verification(procedure).steps)
             if (a := accepted.get(step.id)) is not None
         }
 
+    def _parse(self, key: str, file: EmbeddedFile, model: type[M]) -> M:
+        return settings_file.parse_text(
+            file.text.encode(), model, f"{self.folder / JOURNAL}: line 1: {key}.text ({file.name})"
+        )
+
 
 def require_session(folder: Path) -> None:
     """Raise `InputError` unless the folder contains a session."""
-    if not (folder / JOURNAL).exists():
+    if not os.path.exists(folder / JOURNAL):  # False also for a name that the system cannot have
         raise InputError(f"{folder}: expected a session, got no {JOURNAL} in it")
-
-
-def _parse(file: EmbeddedFile, model: type[M]) -> M:
-    return settings_file.parse_text(file.text.encode(), model, file.name)
 
 
 def _withdraws_result(entry: Entry) -> bool:

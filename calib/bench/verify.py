@@ -1,17 +1,36 @@
-"""Verification of a session: check its files, and recompute the result from the recordings."""
+"""Verification of a session or a certificate: hashes, signatures, and the result, computed again.
 
+Hashes detect accidents. Only a signature of a key that is trusted detects forgery.
+"""
+
+import os
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from calib.bench import journal
+from calib.bench.journal import Contents
 from calib.bench.result import decode_covered, identify_session
-from calib.bench.state import JOURNAL, LOCK, RESULT, SessionState, require_session
+from calib.bench.state import (
+    INITIAL_CERTIFICATE,
+    JOURNAL,
+    LOCK,
+    PROFILE,
+    RESULT,
+    WORKING_CERTIFICATE,
+    SessionState,
+    require_session,
+)
 from calib.certificate import PROVENANCE_IDENTIFIED
-from imudrv.calibration import Calibration, read_calibration
+from calib.signing.certificates import signature_fault
+from calib.signing.keys import bench_key
+from calib.signing.signatures import fingerprint, is_valid
+from imudrv.calibration import Calibration, Signature, read_calibration, read_calibration_file
 from imudrv.errors import InputError
 from imudrv.files import atomic
+from imudrv.recording.reader import Recording
 from imudrv.units import MM
 
 
@@ -23,24 +42,42 @@ class Verified(NamedTuple):
     faults : tuple of str
         Faults, each with its line or file; empty if there are none.
     notes : tuple of str
-        What was checked, and remarks.
+        What was checked, by whom it is signed, and remarks.
+    unfinished : tuple of str
+        Why the session is unfinished; empty if it is at its end.
+    untrusted : tuple of str
+        What is not signed by a trusted key; empty if no trusted keys were given.
     """
 
     faults: tuple[str, ...]
     notes: tuple[str, ...]
+    unfinished: tuple[str, ...] = ()
+    untrusted: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        """Return one line per note and fault."""
-        return "\n".join([*self.notes, *(f"fault: {fault}" for fault in self.faults)])
+        """Return one line per note, fault and so on."""
+        return "\n".join(
+            [
+                *self.notes,
+                *(f"fault: {fault}" for fault in self.faults),
+                *(f"unfinished: {reason}" for reason in self.unfinished),
+                *(f"not trusted: {reason}" for reason in self.untrusted),
+            ]
+        )
 
 
-def verify(folder: Path) -> Verified:
-    """Check the journal, the hashes, that recordings cover their steps, and that they give the certificate.
+def verify(path: Path, trusted: Mapping[str, str] | None = None) -> Verified:
+    """Verify a session or a certificate; nothing is changed.
 
     Parameters
     ----------
-    folder : Path
-        Folder of the session; nothing in it is changed.
+    path : Path
+        Folder of a session: journal, hashes, signatures, that plan, certificates and recordings belong to one
+        unit, that recordings cover their steps, and that they give the certificate. Or a certificate: its
+        signature.
+    trusted : mapping of str to str, optional
+        Names of trusted keys by public key. If given, session and certificate must be signed by one of them;
+        otherwise only the bench's own key has a name.
 
     Returns
     -------
@@ -49,35 +86,19 @@ def verify(folder: Path) -> Verified:
     Raises
     ------
     InputError
-        The folder contains no session.
+        There is neither a session nor a certificate; or a signature cannot be checked, because the package
+        cryptography is not installed.
     """
-    require_session(folder)
-    try:
-        entries, _, partial = journal.read(folder / JOURNAL)
-        session = SessionState(folder, entries)
-    except InputError as error:
-        return Verified((str(error),), ())
-    files = session.files
-    faults = [f"{folder / JOURNAL}: {partial}"] if partial else []
-    faults += faulty_files(session) or uncovered_steps(session)
-    notes = [f"{len(entries)} lines and {len(files)} files checked"]
-    unknown = sorted({path.name for path in folder.iterdir() if path.is_file()} - {*files, JOURNAL, LOCK})
-    notes += [f"{folder / name}: not in the journal, not checked" for name in unknown]
-    if not faults and RESULT not in files:
-        notes.append("there is no certificate yet")
-    elif not faults:
-        faults = _certificate_faults(session)
-        if not faults:
-            notes.append("the recordings give the certificate, digit for digit")
-    return Verified(tuple(faults), tuple(notes))
+    is_file = os.path.isfile(path)  # False also for a name that the system cannot have
+    return _verify_certificate(path, trusted) if is_file else _verify_session(path, trusted)
 
 
 def faulty_files(session: SessionState) -> list[str]:
     """Return the missing and damaged files of a session, one line each."""
     faults = []
     for name, digest in session.files.items():
-        path = session.folder / name
         try:
+            path = session.path(name)
             found = atomic.sha256(path)
         except InputError as error:
             faults.append(str(error))
@@ -89,7 +110,122 @@ def faulty_files(session: SessionState) -> list[str]:
     return faults
 
 
-def uncovered_steps(session: SessionState) -> list[str]:
+def _verify_certificate(path: Path, trusted: Mapping[str, str] | None) -> Verified:
+    file = read_calibration_file(path)
+    if fault := signature_fault(file, str(path)):
+        return Verified((fault,), ())
+    note, untrusted = _signer(str(path), file.model.signature, trusted)
+    return Verified((), (note,), (), untrusted)
+
+
+def _verify_session(folder: Path, trusted: Mapping[str, str] | None) -> Verified:
+    require_session(folder)
+    try:
+        contents = journal.read(folder / JOURNAL)
+        session = SessionState(folder, contents.entries)
+    except InputError as error:
+        return Verified((str(error),), ())
+    files = session.files
+    faults = _signature_faults(folder, contents) + faulty_files(session)
+    if not faults:
+        faults = [*_disagreements(session), *_uncovered_steps(session)]
+    notes = [f"{len(contents.entries)} lines and {len(files)} files checked"]
+    unknown = {path.name for path in folder.iterdir() if path.is_file()} - {*files, JOURNAL, LOCK, PROFILE}
+    shown = (name if name.isprintable() else ascii(name) for name in sorted(unknown))
+    notes += [f"{folder / name}: not in the journal, not checked" for name in shown]
+    signed = {JOURNAL: contents.signature}
+    if not faults and RESULT not in files:
+        if session.is_over:
+            faults = [f"{folder / RESULT}: expected in the journal of a session at its end, it is not there"]
+        notes.append("there is no certificate yet")
+    elif not faults:
+        faults = _certificate_faults(session)
+        signed[RESULT] = read_calibration(session.path(RESULT)).signature
+        if not faults:
+            notes.append("the recordings give the certificate, digit for digit")
+    untrusted: list[str] = []
+    if not faults:
+        for name, signature in signed.items():
+            note, reasons = _signer(str(folder / name), signature, trusted)
+            notes.append(note)
+            untrusted += reasons
+    return Verified(tuple(faults), tuple(notes), tuple(_unfinished(session, contents)), tuple(untrusted))
+
+
+def _unfinished(session: SessionState, contents: Contents) -> Iterator[str]:
+    """Yield why a session is unfinished."""
+    if contents.partial is not None:
+        yield f"{session.folder / JOURNAL}: {contents.partial}"
+    if not session.is_over:
+        steps = ", ".join(session.accepted) or "none"
+        yield f"accepted steps: {steps}; resume with: calib run --session {session.folder}"
+
+
+def _signature_faults(folder: Path, contents: Contents) -> list[str]:
+    return [
+        f"{folder / JOURNAL}: line {number}: expected the signature of the lines before it by the key "
+        f"{fingerprint(signature.public_key)}, got one that does not match; a line was changed later"
+        for number, signature, data in contents.signatures
+        if not is_valid(signature, data)
+    ]
+
+
+def _signer(
+    name: str, signature: Signature | None, trusted: Mapping[str, str] | None
+) -> tuple[str, tuple[str, ...]]:
+    """Return who has signed a file, and, if that is not a trusted key, why not."""
+    if signature is None:
+        is_trusted, signer = False, "unsigned"
+    else:
+        names = _own_key() if trusted is None else trusted
+        is_trusted = signature.public_key in names
+        owner = names.get(signature.public_key, "an unknown key")
+        signer = f"signed by {owner} ({fingerprint(signature.public_key)})"
+    if trusted is None or is_trusted:
+        return f"{name}: {signer}", ()
+    return f"{name}: {signer}", (f"{name}: expected the signature of a trusted key, it is {signer}",)
+
+
+def _own_key() -> dict[str, str]:
+    key = bench_key()
+    return {} if key is None else {key.public_key: key.name}
+
+
+def _disagreements(session: SessionState) -> Iterator[str]:
+    """Yield where certificates and recordings are not those of the plan."""
+    plan, working = session.plan, session.path(WORKING_CERTIFICATE)
+    try:
+        before = read_calibration_file(session.path(INITIAL_CERTIFICATE), plan.unit)
+        if before.sha256 != plan.certificate.sha256:
+            yield (
+                f"{session.folder / INITIAL_CERTIFICATE}: expected the certificate of the plan, SHA-256 "
+                f"{plan.certificate.sha256[:12]}..., got {before.sha256[:12]}..."
+            )
+        if read_calibration(working) != before.model.without_size_effect():
+            yield f"{working}: expected {INITIAL_CERTIFICATE} without size effect, got other values"
+        if RESULT in session.files:
+            result = read_calibration_file(session.path(RESULT), plan.unit)
+            if fault := signature_fault(result, str(session.path(RESULT))):
+                yield fault
+        for attempt in session.attempts().values():
+            yield from _foreign(session, Recording(attempt.recording))
+    except InputError as error:
+        yield str(error)
+
+
+def _foreign(session: SessionState, recording: Recording) -> Iterator[str]:
+    """Yield what a recording has from another unit or session."""
+    plan = session.plan
+    unit, calibration = recording.origin.get("unit", ""), recording.calibration_text
+    if unit != plan.unit:
+        yield f"{recording.path}: expected a recording of unit {plan.unit!r}, got one of {unit!r}"
+    if recording.profile_text != plan.profile.text:
+        yield f"{recording.path}: expected the profile of the plan, {plan.profile.name}, got another one"
+    if calibration is not None and calibration.encode() != atomic.content(session.path(WORKING_CERTIFICATE)):
+        yield f"{recording.path}: expected the calibration {WORKING_CERTIFICATE}, got another one"
+
+
+def _uncovered_steps(session: SessionState) -> list[str]:
     """Return the accepted steps whose recordings lack samples, one line each."""
     faults = []
     for attempt in session.attempts().values():
@@ -101,7 +237,7 @@ def uncovered_steps(session: SessionState) -> list[str]:
 
 
 def _certificate_faults(session: SessionState) -> list[str]:
-    path = session.folder / RESULT
+    path = session.path(RESULT)
     stored = read_calibration(path)
     try:
         again = identify_session(session).certificate
@@ -115,7 +251,9 @@ def _certificate_faults(session: SessionState) -> list[str]:
 def _timeless(calibration: Calibration) -> dict[str, Any]:
     """Return a certificate without the time and software version of its computation."""
     document = calibration.model_dump(mode="json", exclude={"created"})
-    document["provenance"][PROVENANCE_IDENTIFIED].pop("software", None)
+    how = (document["provenance"] or {}).get(PROVENANCE_IDENTIFIED)
+    if isinstance(how, dict):
+        how.pop("software", None)
     return document
 
 

@@ -10,7 +10,11 @@ from imudrv.terminal import run_program
 
 COMMANDS: Final = {
     "run": "Run the bench procedure with a unit: from the first pose to its new certificate.",
-    "verify": "Check the files of a session, and compute its result again from the recordings.",
+    "verify": (
+        "Check a session or a certificate: files, signatures, and the result, computed again; "
+        "exit code 2 damaged, 3 unfinished, 4 not signed by a trusted key."
+    ),
+    "key": "Make or show the key with which this bench signs its sessions and certificates.",
     "identify": "Identify lever arms from captures of rotations: certificate and report.",
     "align": "Align a rest: level, heading, and its readings against the site; exit code 3 if it moved.",
     "validate": "Navigate the same pulses with and without compensation; exit code 3 if a verdict is bad.",

@@ -8,7 +8,9 @@ from calib.certificate import PROVENANCE_CONVERTED, lever_arms_of, with_lever_ar
 from calib.cli.arguments import add_certificate_output, add_gauge, check_output, known_point, written_text
 from calib.lever_arms.gauge import convert
 from calib.reports.identification import arms_text
+from calib.signing.keys import bench_key
 from imudrv.calibration import read_calibration_file
+from imudrv.terminal import say
 from imudrv.units import MM
 
 EXAMPLE: Final = "unit.yaml --to x -o unit-x.yaml"
@@ -24,6 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Convert the gauge of a certificate."""
     check_output(arguments.output, arguments.file)
+    key = bench_key()
     file = read_calibration_file(arguments.file)
     before = lever_arms_of(file.model, str(arguments.file))
     point = known_point(arguments.at)
@@ -32,6 +35,6 @@ def run(arguments: argparse.Namespace) -> None:
     if point is not None:
         accelerometer, r_b = point
         how["stated_mm"] = {accelerometer: [value / MM for value in r_b]}
-    write(arguments.output, with_lever_arms(file.model, arms, PROVENANCE_CONVERTED, how))
+    write(arguments.output, with_lever_arms(file.model, arms, PROVENANCE_CONVERTED, how), key)
     print(arms_text(arms), end="")
-    print(written_text(arguments.output, file.model, arms))
+    say(written_text(arguments.output, file.model, arms))

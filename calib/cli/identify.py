@@ -21,12 +21,14 @@ from calib.reports.identification import document, report_html
 from calib.reports.text import print_document
 from calib.reports.truth import comparison
 from calib.result_file import result_document, write_json
+from calib.signing.keys import bench_key
 from imudrv.calibration import read_calibration
 from imudrv.cli.arguments import add_profile
 from imudrv.errors import InputError
 from imudrv.files.atomic import atomic_write
+from imudrv.files.inputs import total_size
 from imudrv.imu.rate_filter import NAMES
-from imudrv.terminal import progress
+from imudrv.terminal import progress, say
 from imudrv.units import PPM, UG, URAD
 
 MAX_SIGMA: Final = 1e5
@@ -69,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--skew-sigma-ms", type=_sigma, metavar="MS", help=text)
     text = (
         "1 sigma of the biases, scale factors and misalignments of the calibration; default: those in the "
-        "calibration, or else 50 ug, 20 ppm and 100 urad"
+        "calibration, or else 100 ug, 50 ppm and 100 urad"
     )
     add("--prior-sigma", type=_sigma, nargs=3, metavar=("UG", "PPM", "URAD"), help=text)
     add_certificate_output(parser)
@@ -87,6 +89,7 @@ def run(arguments: argparse.Namespace) -> None:
         check_output(output, *inputs)
     prior = prior_calibration(arguments.captures, arguments.calibration, arguments.unit)
     check_target(arguments.output, prior.calibration)
+    key = bench_key()
     options = EstimationOptions(
         arguments.method,
         arguments.pivot,
@@ -96,8 +99,7 @@ def run(arguments: argparse.Namespace) -> None:
         priors=_priors(arguments.prior_sigma),
         skew_sigma_s=None if arguments.skew_sigma_ms is None else arguments.skew_sigma_ms * 1e-3,
     )
-    size = sum(path.stat().st_size for path in arguments.captures if path.exists())
-    with progress("identify", 2 * size) as advance:  # each capture is read twice
+    with progress("identify", total_size(arguments.captures * 2)) as advance:  # each is read twice
         result = identify(
             arguments.captures,
             site=arguments.site,
@@ -118,11 +120,11 @@ def run(arguments: argparse.Namespace) -> None:
             with atomic_write(arguments.report) as file:
                 file.write(report_html(result, gauges).encode())
             written.append(f"{arguments.report}: the report")
-        write(arguments.output, certificate(result, arms))
+        write(arguments.output, certificate(result, arms), key)
         written.append(written_text(arguments.output, prior.calibration, arms))
     finally:
         print_document(document(result, gauges))
-        print(*written, sep="\n")
+        say("\n".join(written))
     if arguments.truth is not None:
         true = lever_arms_of(read_calibration(arguments.truth), str(arguments.truth))
         print_document(comparison(arms, true, arguments.truth.name))

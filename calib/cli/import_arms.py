@@ -12,10 +12,12 @@ from calib.certificate import PROVENANCE_IDENTIFIED, with_lever_arms, write
 from calib.cli.arguments import PROGRAMS, add_certificate_output, check_output, written_text
 from calib.lever_arms.interchange import from_kalibr, from_psins
 from calib.reports.identification import arms_text
+from calib.signing.keys import bench_key
 from imudrv.calibration import read_calibration
 from imudrv.errors import InputError
 from imudrv.files import atomic, settings_file
 from imudrv.files.model import Model
+from imudrv.terminal import say
 
 EXAMPLE: Final = "imu.yaml --from kalibr --calibration unit.yaml -o new.yaml"
 
@@ -34,6 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Write lever arms of another program to a certificate."""
     check_output(arguments.output, arguments.file, arguments.calibration)
+    key = bench_key()
     calibration = read_calibration(arguments.calibration)
     if arguments.program == "kalibr":
         file = settings_file.read_file(arguments.file, _Kalibr)
@@ -42,9 +45,9 @@ def run(arguments: argparse.Namespace) -> None:
         content = atomic.content(arguments.file)
         arms, digest = from_psins(_clbt(content, arguments.file)), sha256(content).hexdigest()
     how = {"method": f"imported from {arguments.program}", "file_sha256": digest}
-    write(arguments.output, with_lever_arms(calibration, arms, PROVENANCE_IDENTIFIED, how))
+    write(arguments.output, with_lever_arms(calibration, arms, PROVENANCE_IDENTIFIED, how), key)
     print(arms_text(arms), end="")
-    print(written_text(arguments.output, calibration, arms))
+    say(written_text(arguments.output, calibration, arms))
 
 
 class _Kalibr(Model):

@@ -4,12 +4,11 @@ import argparse
 from pathlib import Path
 from typing import Final
 
-from rich.console import Console
-
 from calib.bench.run import RunOptions, new_folder
 from calib.bench.run import run as run_session
 from calib.procedure import plan
 from imudrv.cli.arguments import add_profile
+from imudrv.terminal import console
 
 EXAMPLE: Final = (
     "--port /dev/ttyUSB0 --profile imu50-rs422 --calibration unit.yaml --site site.yaml --session s1"
@@ -41,4 +40,4 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run or resume a session at the bench."""
-    return run_session(RunOptions(**vars(arguments)), Console())
+    return run_session(RunOptions(**vars(arguments)), console())

@@ -6,8 +6,6 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Final
 
-from rich.console import Console
-
 from calib.api import validate
 from calib.certificate import lever_arms_of
 from calib.cli.arguments import add_channel, check_output
@@ -21,14 +19,12 @@ from imudrv.calibration import Calibration, read_calibration
 from imudrv.cli.arguments import add_profile
 from imudrv.errors import InputError
 from imudrv.files.atomic import atomic_write
+from imudrv.files.inputs import total_size
 from imudrv.imu.rate_filter import NAMES
 from imudrv.nav.alignment import ALIGNMENT_S
-from imudrv.terminal import OK, progress
+from imudrv.terminal import NOT_GOOD, OK, console, progress
 
 EXAMPLE: Final = "--simulate rocking --seeds 20 --report validation.html"
-
-NOT_GOOD: Final = 3
-"""Exit code: a verdict is bad."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -78,9 +74,9 @@ def _simulated(arguments: argparse.Namespace) -> Iterator[Trial]:
     which, seeds, name = arguments.simulate, arguments.seeds, arguments.rate_filter
     if seeds < 1:
         raise InputError(f"--seeds: expected 1 or more, got {seeds}")
-    console = Console(stderr=True)
+    screen = console(stderr=True)
     names = tuple(TRIALS) if which == "all" else (which,)
-    with console.status("simulate") if console.is_terminal else nullcontext() as status:
+    with screen.status("simulate") if screen.is_terminal else nullcontext() as status:
         yield from campaign(names, range(1, seeds + 1), name, status.update if status else lambda _: None)
         if which == "all":
             yield from skew_trials(1)
@@ -94,7 +90,7 @@ def _navigated(arguments: argparse.Namespace) -> tuple[Calibration, list[Validat
     lever_arms_of(calibration, str(arguments.calibration))
     found = []
     for path in arguments.recordings:
-        with progress(path.name, path.stat().st_size if path.exists() else 0) as advance:
+        with progress(path.name, total_size([path])) as advance:
             validation = validate(
                 path,
                 calibration=calibration,

@@ -12,6 +12,7 @@ from rich.table import Table as RichTable
 from rich.text import Text as RichText
 
 from calib.reports.document import MARKS, Block, Document, Figure, KeyValues, Paragraph
+from imudrv.terminal import console, printable
 
 WIDTH: Final = 80
 """Columns of the text."""
@@ -20,23 +21,23 @@ WIDTH: Final = 80
 def for_terminal(document: Document) -> RenderableType:
     """Return a document for a console, without its figures."""
     parts: list[RenderableType] = [
-        RichText(document.title, style="bold"),
-        RichText(document.subtitle),
+        _plain(document.title, style="bold"),
+        _plain(document.subtitle),
         "",
     ]
     for section in document.sections:
-        parts += [RichText(section.title.upper(), style="bold")]
+        parts += [_plain(section.title.upper(), style="bold")]
         parts += chain.from_iterable(_shown(block) for block in section.blocks)
     return Group(*parts)
 
 
 def print_document(document: Document) -> None:
     """Print a document: in colour and in full width on a terminal, elsewhere as plain text."""
-    console = Console(highlight=False)
-    if console.is_terminal:
-        console.print(for_terminal(document))
+    screen = console()
+    if screen.is_terminal:
+        screen.print(for_terminal(document))
     else:
-        console.file.write(as_text(document))
+        screen.file.write(as_text(document))
 
 
 def as_text(document: Document) -> str:
@@ -55,23 +56,27 @@ def _text(shown: RenderableType) -> str:
     return "".join(f"{line.rstrip()}\n" for line in out.getvalue().splitlines())
 
 
+def _plain(text: str, style: str = "") -> RichText:
+    return RichText(printable(text), style)
+
+
 def _shown(block: Block) -> Iterator[RenderableType]:
     if isinstance(block, Figure):
         return
     if isinstance(block, Paragraph):
-        yield Padding(RichText(block.text), (0, 0, 1, 2))
+        yield Padding(_plain(block.text), (0, 0, 1, 2))
     elif isinstance(block, KeyValues):
         grid = RichTable.grid(padding=(0, 2, 0, 0))
         grid.add_column()
         grid.add_column(overflow="fold")
         for name, value in block.rows:
-            grid.add_row(RichText(name, style=MARKS.get(name, "dim")), RichText(value))
+            grid.add_row(_plain(name, style=MARKS.get(name, "dim")), _plain(value))
         yield Padding(grid, (0, 0, 1, 2))
     else:
         table = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False)
         for k, name in enumerate(block.head):
-            table.add_column(RichText(name), justify="right" if k else "left", overflow="fold")
+            table.add_column(_plain(name), justify="right" if k else "left", overflow="fold")
         for row in block.rows:
-            table.add_row(*map(RichText, row))
-        yield Padding(RichText(block.title), (0, 0, 0, 2))
+            table.add_row(*map(_plain, row))
+        yield Padding(_plain(block.title), (0, 0, 0, 2))
         yield Padding(table, (0, 0, 1, 2))

@@ -7,8 +7,9 @@ from typing import Final, NamedTuple
 
 from imudrv.capture_files import recognise
 from imudrv.capture_files.recognise import Kind
-from imudrv.capture_files.source import DAMAGED, Source
+from imudrv.capture_files.source import DAMAGED, Pipe, Source
 from imudrv.errors import InputError
+from imudrv.files.inputs import is_pipe, reason
 
 _HEAD_BYTES: Final = 1 << 16
 _JOINED_BYTES: Final = 1 << 17
@@ -25,13 +26,9 @@ _READERS: Final = {
     recognise.MDF: "can_logs.read_mdf",
 }
 """Readers by kind, imported at first use; other kinds are read as they are."""
-_UNPACKED_ONLY: Final = (
-    recognise.DATABASE,
-    recognise.MDF,
-    recognise.RECORDING,
-    recognise.GZIP,
-    recognise.ZSTANDARD,
-)
+_FILES_ONLY: Final = (recognise.DATABASE, recognise.MDF, recognise.RECORDING)
+"""Kinds that are not read from the beginning to the end."""
+_UNPACKED_ONLY: Final = (*_FILES_ONLY, recognise.GZIP, recognise.ZSTANDARD)
 
 
 class Piece(NamedTuple):
@@ -55,13 +52,13 @@ class CaptureFile:
     Parameters
     ----------
     path : Path
-        The file.
+        The file, or a pipe, whose content can be read once.
 
     Attributes
     ----------
     path : Path
     size : int
-        Size of the file as it is stored, bytes.
+        Size of the file as it is stored, bytes; of a pipe what was read so far.
     kind : Kind or None
         What its content is; None if it is no known form, and may be wire bytes.
     archive : Kind or None
@@ -70,23 +67,27 @@ class CaptureFile:
     Raises
     ------
     InputError
-        There is no such file, it is empty, is named otherwise than it is, or cannot be read in this form.
+        There is no such file, it is a folder or a device, is empty, is named otherwise than it is, or cannot
+        be read in this form.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.archive: Kind | None = None
         try:
-            self.size = path.stat().st_size
-            with path.open("rb") as file:
-                self._head = file.read(_HEAD_BYTES)
+            self._pipe = Pipe(path) if is_pipe(path) else None
+            with self._open() as source:
+                self._head = source.read(_HEAD_BYTES)
+            self.size = path.stat().st_size  # of a pipe 0
         except OSError as error:
-            raise InputError(f"{path}: expected a capture file, cannot read it: {error.strerror}") from error
+            raise InputError(f"{path}: cannot be read: {reason(error)}") from error
         if not self._head:
             raise InputError(f"{path}: expected a capture, got an empty file")
-        self.archive: Kind | None = None
-        self.kind = recognise.recognise(path, path, self._head)
+        self.kind = self._recognised(PurePath(path.name))
         if self.kind is recognise.GZIP or self.kind is recognise.ZSTANDARD:
             self._recognise_content(self.kind)
+        if self._pipe is not None and self.kind in _FILES_ONLY:
+            raise InputError(f"{path}: expected a file with {self.kind.name}, got a pipe; write a file first")
 
     @property
     def is_recording(self) -> bool:
@@ -138,7 +139,9 @@ class CaptureFile:
                     raise
                 except Exception as error:  # a reader may raise anything
                     raise self._explained(error, source) from error
-                end = source.position if data else self.size  # a reader need not read to the end
+                # A reader need not read to the end.
+                end = source.position if data or self._pipe is not None else self.size
+                self.size = max(self.size, end)
                 yield Piece(data, end - begin)
                 begin = end
                 if not data:
@@ -146,7 +149,7 @@ class CaptureFile:
 
     def _open(self) -> Source:
         try:
-            return Source(self.path, self.archive)
+            return Source(self.path, self.archive, self._pipe)
         except OSError as error:
             raise InputError(f"{self.path}: cannot be read: {error.strerror}") from error
 
@@ -158,14 +161,16 @@ class CaptureFile:
         read = getattr(import_module(f"imudrv.capture_files.{module}"), name)
         return read(source)
 
+    def _recognised(self, name: PurePath) -> Kind | None:
+        return recognise.recognise(self.path, name if self._pipe is None else None, self._head)
+
     def _recognise_content(self, archive: Kind) -> None:
         """Recognise what is in the archive."""
-        name = PurePath(self.path.stem)
         self.archive, self.kind = archive, None
         self._head = self.head()
         if not self._head:
             raise InputError(f"{self.path}: expected a capture, got an empty file in {archive.name}")
-        self.kind = recognise.recognise(self.path, name, self._head)
+        self.kind = self._recognised(PurePath(self.path.stem))
         if self.kind in _UNPACKED_ONLY:
             raise InputError(f"{self.path}: expected a log or wire bytes, got {self.description}; unpack it")
 

@@ -137,15 +137,16 @@ def is_text(head: bytes) -> bool:
     return _CONTROL.search(head[:_LOOKED_AT]) is None
 
 
-def recognise(path: PurePath, name: PurePath, head: bytes) -> Kind | None:
+def recognise(path: PurePath, name: PurePath | None, head: bytes) -> Kind | None:
     """Return the kind of a file, or None if neither its name nor its content is of a known one.
 
     Parameters
     ----------
     path : PurePath
         The file, for messages.
-    name : PurePath
-        Name whose suffix counts: without ``.gz`` if the content is unpacked.
+    name : PurePath or None
+        Name whose suffix counts: without ``.gz`` if the content is unpacked; None for a pipe, whose name says
+        nothing.
     head : bytes
         Beginning of the content.
 
@@ -154,7 +155,7 @@ def recognise(path: PurePath, name: PurePath, head: bytes) -> Kind | None:
     InputError
         Name and content contradict each other, or the file cannot be read; the message says what it is.
     """
-    suffix = name.suffix.lower()
+    suffix = "" if name is None else name.suffix.lower()
     named, kind = _BY_SUFFIX.get(suffix), kind_of_content(head)
     if kind is None:
         if named is None:
@@ -164,7 +165,7 @@ def recognise(path: PurePath, name: PurePath, head: bytes) -> Kind | None:
         )
     if kind.advice:
         raise InputError(f"{path}: expected a capture, got {kind.name}; {kind.advice}")
-    if named is kind or (named is None and not kind.suffix):
+    if name is None or named is kind or (named is None and not kind.suffix):
         return kind
     raise InputError(
         f"{path}: named {suffix or 'without a suffix'}, but is {kind.name}; "

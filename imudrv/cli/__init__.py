@@ -20,7 +20,9 @@ COMMANDS: Final = {
     "pack": "Compress a recording.",
     "sim": "Simulate a unit: to a capture, or live on a port.",
     "profiles": "List the shipped profiles, print one, or begin one from a DBC file.",
+    "files": "Write the files for C programs, udev and systemd to a folder.",
     "check": "Check a calibration, site, profile, scenario or settings file.",
+    "warm": "Compile all kernels ahead of the first start.",
 }
 
 

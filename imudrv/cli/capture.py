@@ -6,7 +6,7 @@ from pathlib import Path
 
 from imudrv.capture import Capture
 from imudrv.cli.arguments import add_profile, message_stream
-from imudrv.terminal import BAD_INPUT, OK
+from imudrv.terminal import BAD_INPUT, OK, say
 from imudrv.wire.layout import Layout, SequenceKind
 
 
@@ -28,25 +28,25 @@ def print_losses(capture: Capture, output: Path) -> int:
     stream = message_stream(output)
     file = capture.file
     what = f" of {file.description}" if file.is_converted or file.archive else ""
-    print(f"{capture.path}: {capture.layout.name}, {capture.size} bytes{what} -> {output}", file=stream)
+    say(f"{capture.path}: {capture.layout.name}, {capture.size} bytes{what} -> {output}", stream)
     if capture.is_profile_found:
-        print(f"  profile {capture.layout.name}: found, for it fits best of the shipped ones", file=stream)
+        say(f"  profile {capture.layout.name}: found, for it fits best of the shipped ones", stream)
     counts = capture.tracker.counts
-    print(f"  {counts}", file=stream)
+    say(f"  {counts}", stream)
     if counts.unknown_gaps:
-        print(f"  {_unknown_gaps(counts.unknown_gaps, capture.layout)}", file=stream)
+        say(f"  {_unknown_gaps(counts.unknown_gaps, capture.layout)}", stream)
     for reason, rejected in sorted(capture.rejected.items()):
         name = reason.name.lower().replace("_", " ")
         first = ", ".join(map(str, rejected.first))
         more = ", ..." if rejected.runs > len(rejected.first) else ""
         where = "" if file.is_converted else f", at {first}{more}"
-        print(f"  {name}: {rejected.runs} x, {rejected.length} in all{where}", file=stream)
+        say(f"  {name}: {rejected.runs} x, {rejected.length} in all{where}", stream)
     for channel, messages in list(capture.channels.items())[1:]:
-        print(f"  ignored: {messages} messages of channel {channel}", file=stream)
+        say(f"  ignored: {messages} messages of channel {channel}", stream)
     for hint in capture.hints:
-        print(f"  hint: {hint}", file=stream)
+        say(f"  hint: {hint}", stream)
     if fault := capture.sequence_fault:
-        print(f"error: {capture.path}: {fault}", file=sys.stderr)
+        say(f"error: {capture.path}: {fault}", sys.stderr)
         return BAD_INPUT
     return OK
 

@@ -7,15 +7,16 @@ from pathlib import Path
 from typing import Final
 
 from imudrv.calibration import Calibration
-from imudrv.diagnosis import line_load
 from imudrv.errors import FaultyFileError, InputError
 from imudrv.files import settings_file
 from imudrv.files.model import Model
+from imudrv.profiles.line_load import line_load
 from imudrv.profiles.schema import CanLine, Profile
 from imudrv.profiles.summary import line, summary
 from imudrv.service.settings import Settings
 from imudrv.sim.scenario import Scenario
 from imudrv.site import Site
+from imudrv.terminal import say
 
 EXAMPLE: Final = "unit.yaml"
 
@@ -41,10 +42,10 @@ def run(arguments: argparse.Namespace) -> None:
     model = settings_file.read(arguments.file, _KINDS[kind])
     if isinstance(model, Profile) and (faults := list(_line_faults(model))):
         raise FaultyFileError(str(arguments.file), faults)
-    print(f"{arguments.file}: valid {kind} file")
+    say(f"{arguments.file}: valid {kind} file")
     if isinstance(model, Profile):
         for subject, description in (("line", _line(model)), *summary(model)):
-            print(f"  {subject + ':':15}{description}")
+            say(f"  {subject + ':':15}{description}")
 
 
 def _line_faults(profile: Profile) -> Iterator[str]:

@@ -12,7 +12,7 @@ from imudrv.files.outputs import require_other
 from imudrv.files.tables import increment_columns, table
 from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import NAMES
-from imudrv.terminal import progress
+from imudrv.terminal import progress, say
 
 EXAMPLE: Final = "z-up.raw --profile imu50-rs422 --calibration unit.yaml -o increments.npz"
 
@@ -44,7 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
     compensator = Compensator(coefficients(calibration), capture.layout, arguments.rate_filter)
     with (
         table(arguments.output, (".csv", ".npz", ".i50n"), {}) as rows,
-        progress("compensate", capture.size) as advance,
+        progress("compensate", capture.size or None) as advance,
     ):
         for increments in capture.increments(compensator, advance):
             rows.write(increment_columns(increments))
@@ -55,9 +55,9 @@ def run(arguments: argparse.Namespace) -> int:
         size_effect = "not compensated: the calibration has no sensing points"
     elif not compensator.has_size_effect:
         size_effect = f"not compensated: {capture.layout.name} lacks axes"
-    print(f"  unit {calibration.serial_number}, {origin}", file=stream)
-    print(
+    say(f"  unit {calibration.serial_number}, {origin}", stream)
+    say(
         f"  size effect {size_effect}; rate filter {arguments.rate_filter}, delay {compensator.lag} samples",
-        file=stream,
+        stream,
     )
     return code

@@ -25,7 +25,7 @@ def run(arguments: argparse.Namespace) -> int:
     parts = {"temperature_degc": capture.layout.temperature_names}
     with (
         table(arguments.output, (".csv", ".npz"), parts) as rows,
-        progress("decode", capture.size) as advance,
+        progress("decode", capture.size or None) as advance,
     ):
         for pulses in capture.pulses(advance):
             rows.write(pulse_columns(pulses, capture.layout))

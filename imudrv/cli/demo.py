@@ -30,5 +30,5 @@ def run(arguments: argparse.Namespace) -> int:
     command = ["run", "--rehearse", "--speed", "max", "--session", str(session)]
     code = subprocess.run([sys.executable, "-m", "calib", *command], check=False).returncode
     if code == 0:
-        print(f"to check the result from the recordings: tools/run calib verify {session}")
+        print(f"to check the result from the recordings: calib verify {session}")
     return code

@@ -5,7 +5,7 @@ from typing import Final
 
 from imudrv.cli.arguments import add_profile
 from imudrv.doctor.examine import doctor
-from imudrv.terminal import BAD_INPUT, OK
+from imudrv.terminal import BAD_INPUT, OK, say
 
 EXAMPLE: Final = "--port /dev/ttyUSB0"
 
@@ -18,4 +18,4 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Examine a port."""
-    return OK if doctor(arguments.port, arguments.profile, print) else BAD_INPUT
+    return OK if doctor(arguments.port, arguments.profile, say) else BAD_INPUT

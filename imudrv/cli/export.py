@@ -7,6 +7,7 @@ from typing import Final
 from imudrv.cli.arguments import add_output, message_stream
 from imudrv.recording.export import KINDS, export, export_datagrams
 from imudrv.recording.reader import Recording
+from imudrv.terminal import say
 
 EXAMPLE: Final = "run.mcap --to npz -o run.npz"
 
@@ -24,4 +25,4 @@ def run(arguments: argparse.Namespace) -> None:
         export_datagrams(arguments.recording, arguments.to, arguments.output)
     else:
         export(Recording(arguments.recording), arguments.to, arguments.output)
-    print(f"{arguments.recording} -> {arguments.output}", file=message_stream(arguments.output))
+    say(f"{arguments.recording} -> {arguments.output}", message_stream(arguments.output))

@@ -4,12 +4,11 @@ import argparse
 from pathlib import Path
 from typing import Final
 
-from rich.console import Console
-
 from imudrv.service.monitor import monitor
 from imudrv.service.status_socket import default_status_path
+from imudrv.terminal import console
 
-EXAMPLE: Final = "--status /tmp/imu50.sock"
+EXAMPLE: Final = "--status /run/imu50/imu50.sock"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -19,4 +18,4 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Show the status of a service until Ctrl-C."""
-    monitor(arguments.status or default_status_path(), Console())
+    monitor(arguments.status or default_status_path(), console())

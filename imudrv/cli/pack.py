@@ -7,6 +7,7 @@ from typing import Final
 from imudrv.cli.arguments import add_output
 from imudrv.files.outputs import require_other
 from imudrv.recording.pack import pack
+from imudrv.terminal import say
 
 EXAMPLE: Final = "run.mcap -o packed.mcap"
 
@@ -22,4 +23,4 @@ def run(arguments: argparse.Namespace) -> None:
     require_other(arguments.output, arguments.recording)
     pack(arguments.recording, arguments.output)
     before, after = arguments.recording.stat().st_size, arguments.output.stat().st_size
-    print(f"{arguments.output}: {after} bytes, was {before}")
+    say(f"{arguments.output}: {after} bytes, was {before}")

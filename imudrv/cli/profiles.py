@@ -7,6 +7,7 @@ from typing import Final
 from imudrv import profiles
 from imudrv.errors import InputError
 from imudrv.profiles.dbc import skeleton
+from imudrv.terminal import say
 
 EXAMPLE: Final = "imu50-can > unit.yaml"
 
@@ -39,4 +40,4 @@ def _list() -> None:
     for name in names:
         profile = profiles.load(name)
         title = profiles.content(name).decode().partition("\n")[0].removeprefix("# ")
-        print(f"{name:{width}}  {profile.transport:6}  {profile.rate_hz:4g} Hz  {title}")
+        say(f"{name:{width}}  {profile.transport:6}  {profile.rate_hz:4g} Hz  {title}")

@@ -3,7 +3,6 @@
 import argparse
 import sys
 from pathlib import Path
-from signal import SIGHUP
 from typing import Final
 
 from imudrv.cli.arguments import add_profile
@@ -13,6 +12,7 @@ from imudrv.service.loop import Service
 from imudrv.service.printer import Printer
 from imudrv.service.runtime import SignalFlags
 from imudrv.service.settings import Settings
+from imudrv.signals import SIGHUP
 from imudrv.terminal import INTERRUPTED, OK
 
 EXAMPLE: Final = (
@@ -31,6 +31,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = "udp://HOST:PORT, tcp://[HOST]:PORT, serial://PATH, can://..., file:NAME; may be repeated"
     add("--out", dest="outputs", action="append", metavar="URL", help=text)
     add("--record", metavar="FILE.mcap", help="record everything; in a folder: one file for each run")
+    text = "have the disk keep the recording at least this often (default: when the system does, 5 to 30 s)"
+    add("--sync", dest="sync_s", type=float, metavar="S", help=text)
     add("--rate-filter", choices=NAMES, help="angular rate for the size effect (default: causal)")
     add("--status", metavar="PATH", help="socket that reports the status")
     add("--realtime", action="store_true", default=None, help="request SCHED_FIFO and locked memory")

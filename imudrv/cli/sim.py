@@ -17,7 +17,7 @@ from imudrv.sim import scenario as scenarios
 from imudrv.sim.capture import record
 from imudrv.sim.live import play
 from imudrv.sim.truth import true_calibration
-from imudrv.terminal import progress
+from imudrv.terminal import progress, say
 from imudrv.url import speed_of
 
 EXAMPLE: Final = "rocking --profile imu50-rs422 --port pty --link /tmp/imu50"
@@ -69,9 +69,9 @@ def _record(arguments: argparse.Namespace) -> None:
             advance(len(truth))
     if arguments.truth is not None and not of_motion:
         write_calibration(arguments.truth, true_calibration(scenario, layout))
-    print(
+    say(
         f"{arguments.output}: {samples} samples of {layout.name}, seed {scenario.seed}",
-        file=message_stream(arguments.output),
+        message_stream(arguments.output),
     )
 
 

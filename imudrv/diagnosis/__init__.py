@@ -9,7 +9,7 @@ line       state of an open line, watched arrival by arrival
 from imudrv.diagnosis.line import LineState, LineWatch
 from imudrv.diagnosis.mismatch import Mismatch, best_profile, find_mismatch, fitting_profiles
 from imudrv.diagnosis.sequence import sequence_fault
-from imudrv.diagnosis.traffic import RATE_TOLERANCE, TrafficSummary, decode_traffic, explain, line_load, rate
+from imudrv.diagnosis.traffic import RATE_TOLERANCE, TrafficSummary, decode_traffic, explain, rate
 
 __all__ = [
     "RATE_TOLERANCE",
@@ -22,7 +22,6 @@ __all__ = [
     "explain",
     "find_mismatch",
     "fitting_profiles",
-    "line_load",
     "rate",
     "sequence_fault",
 ]

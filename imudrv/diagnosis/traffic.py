@@ -1,4 +1,4 @@
-"""Data decoded with a profile: how much of it is frames, at what rate, and how much the line can carry."""
+"""Data decoded with a profile: how much of it is frames, and at what rate."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -6,10 +6,8 @@ from typing import Final
 import numpy as np
 
 from imudrv.imu.sequence import SampleCounts, SequenceTracker
-from imudrv.profiles.messages import Message
-from imudrv.profiles.schema import Profile, SerialLine
+from imudrv.profiles.schema import Profile
 from imudrv.records import EXTENDED, Reason, Records
-from imudrv.units import NS
 from imudrv.wire.decoder import FrameDecoder
 
 FEW: Final = 3
@@ -18,8 +16,6 @@ LEAST_SHARE: Final = 0.1
 """A profile fits if its frames are at least this part of the bytes; of noise they are less."""
 RATE_TOLERANCE: Final = 0.09
 """Largest relative error of a correct rate over 3 s: a stall of 250 ms changes it by less."""
-_IDLE_BITS: Final = 3
-_STUFFING: Final = 1.2
 
 
 @dataclass(frozen=True)
@@ -117,36 +113,6 @@ def decode_traffic(profile: Profile, data: bytes | Records) -> TrafficSummary:
         tuple(active[mask] for mask in sorted(active)),
         dict(zip(layout.temperature_names, degc, strict=False)),
     )
-
-
-def line_load(profile: Profile) -> float:
-    """Return the fraction of the line's capacity that the samples take; on CAN with worst-case bit stuffing.
-
-    Parameters
-    ----------
-    profile : Profile
-        Profile with its line settings and rate.
-
-    Returns
-    -------
-    float
-        More than 1: the line is too slow.
-    """
-    line, rate = profile.line, profile.rate_hz
-    if isinstance(line, SerialLine):
-        return profile.transmission_ns * NS * rate  # how often other messages come is not known
-    if line.data_bitrate is not None:
-        return _STUFFING * (profile.transmission_ns * NS + _IDLE_BITS / line.bitrate) * rate
-    return sum(_most_bits(m) / m.every for m in profile.messages) * rate / line.bitrate
-
-
-def _most_bits(message: Message) -> int:
-    """Return the bits of a classic CAN message with the idle ones that follow, if most bits are stuffed.
-
-    A bit is stuffed after five equal ones, in the data and in the fields before and after (ISO 11898-1).
-    """
-    around, stuffed = (64, 54) if message.can_id[0] & EXTENDED else (44, 34)
-    return 8 * message.length + around + _IDLE_BITS + (stuffed + 8 * message.length - 1) // 4
 
 
 def explain(profile: Profile, traffic: TrafficSummary, seconds: float) -> str:

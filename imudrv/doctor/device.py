@@ -1,9 +1,7 @@
 """The device of a port: does it exist, can it be opened, do other programs use it, does it add latency."""
 
-import grp
 import math
 import os
-import resource
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,10 +9,9 @@ from typing import Final
 
 from imudrv.doctor.verdict import Finding, Verdict
 from imudrv.ports.holders import holders
+from imudrv.ports.permission import RULES_ADVICE, permission_advice
+from imudrv.posix import resource, termios
 from imudrv.service.runtime import PRIORITY
-
-RULES: Final = "tools/99-imu50.rules"
-
 
 _LOW_LATENCY: Final = 1 << 13  # ASYNC_LOW_LATENCY, linux/tty_flags.h
 
@@ -39,6 +36,8 @@ class System:
 
 def limits() -> Iterator[Finding]:
     """Check that `--realtime` would be granted to this user: scheduling priority and locked memory."""
+    if resource is None:
+        return
     for name, limit, enough, key, unit in (
         ("real-time priority", resource.RLIMIT_RTPRIO, PRIORITY, "rtprio 50", "LimitRTPRIO=50"),
         ("locked memory", resource.RLIMIT_MEMLOCK, math.inf, "memlock unlimited", "LimitMEMLOCK=infinity"),
@@ -60,7 +59,9 @@ def _user() -> str:
 
 
 def device_steps(device: Path, system: System) -> Iterator[Finding]:
-    """Check the device of a serial port."""
+    """Check the device of a serial port, where a port is a file."""
+    if termios is None:
+        return
     if not device.exists():
         ports = ", ".join(map(str, candidates(system)))
         fix = (
@@ -71,10 +72,8 @@ def device_steps(device: Path, system: System) -> Iterator[Finding]:
     target = device.resolve()
     yield Finding("device", Verdict.OK, str(device) if target == device else f"{device} is {target}")
     if not os.access(device, os.R_OK | os.W_OK):
-        group = _group(device)
-        found = f"this user cannot open {device}; members of the group {group} can"
-        fix = f"sudo usermod -aG {group} {_user()}, then log in again; or install the udev rule {RULES}"
-        yield Finding("permission", Verdict.FAIL, found, fix)
+        found = f"this user cannot open {device}"
+        yield Finding("permission", Verdict.FAIL, found, permission_advice(device))
         return
     yield Finding("permission", Verdict.OK, "this user can open it")
     users, all_inspected = holders(target, system.proc)
@@ -92,14 +91,6 @@ def candidates(system: System) -> list[Path]:
     taken = {path.resolve() for path in named}
     plain = sorted(path for kind in ("ttyUSB*", "ttyACM*") for path in system.dev.glob(kind))
     return named + [path for path in plain if path.resolve() not in taken]
-
-
-def _group(device: Path) -> str:
-    number = device.stat().st_gid
-    try:
-        return grp.getgrgid(number).gr_name
-    except KeyError:
-        return str(number)
 
 
 def interface_step(name: str, system: System) -> Finding:
@@ -139,7 +130,7 @@ def usb(name: str, system: System) -> Iterator[Finding]:
         yield Finding("latency timer", Verdict.OK, f"{latency_ms} ms")
     elif latency_ms:
         found = f"{latency_ms} ms: samples arrive in bursts of that length"
-        fix = f"echo 1 | sudo tee {timer}; permanently: install the udev rule {RULES}"
+        fix = f"echo 1 | sudo tee {timer}; permanently: {RULES_ADVICE}"
         yield Finding("latency timer", Verdict.WARN, found, fix)
     flags = _read(system.sys / "class" / "tty" / name / "flags")
     if flags and int(flags, 16) & _LOW_LATENCY:
@@ -153,7 +144,7 @@ def usb(name: str, system: System) -> Iterator[Finding]:
         return
     control = adapter / "power" / "control"
     if _read(control) == "auto":
-        fix = f"echo on | sudo tee {control}; permanently: install the udev rule {RULES}"
+        fix = f"echo on | sudo tee {control}; permanently: {RULES_ADVICE}"
         yield Finding("USB autosuspend", Verdict.WARN, "on: the adapter may be suspended", fix)
     else:
         yield Finding("USB autosuspend", Verdict.OK, "off")

@@ -7,6 +7,7 @@ from imudrv import diagnosis, profiles
 from imudrv.diagnosis import Mismatch, TrafficSummary
 from imudrv.doctor.verdict import Finding, Verdict
 from imudrv.ports.base import LineErrors
+from imudrv.profiles.line_load import line_load
 from imudrv.profiles.schema import Profile, SerialLine
 
 _HEAVY_LOAD: Final = 0.9
@@ -14,7 +15,7 @@ _HEAVY_LOAD: Final = 0.9
 
 def check_line_load(profile: Profile) -> Finding:
     """Check that the line can carry the profile's samples."""
-    load = diagnosis.line_load(profile)
+    load = line_load(profile)
     line = profile.line
     speed = f"{line.baudrate} baud" if isinstance(line, SerialLine) else f"{line.bitrate} bit/s"
     found = f"{profile.name} at {profile.rate_hz:g} Hz takes {100 * load:.1f} % of {speed}"

@@ -3,27 +3,30 @@
 import hashlib
 import os
 import secrets
-import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
-from io import BufferedReader
 from pathlib import Path
 from typing import IO, Final
 
 from imudrv.errors import InputError
+from imudrv.files.inputs import open_file, reason
 from imudrv.files.outputs import file_to_write
 
 MAX_BYTES: Final = 1 << 20
 """Largest settings file, bytes."""
 
 
-def content(path: str | os.PathLike[str]) -> bytes:
-    """Return the content of a settings file.
+def content(path: str | os.PathLike[str], max_bytes: int = MAX_BYTES, kind: str = "a settings file") -> bytes:
+    """Return the content of a file, by default a settings file.
 
     Parameters
     ----------
     path : path-like
-        The file, at most `MAX_BYTES`.
+        The file.
+    max_bytes : int
+        Largest size, bytes.
+    kind : str
+        What it is, for messages.
 
     Returns
     -------
@@ -34,11 +37,11 @@ def content(path: str | os.PathLike[str]) -> bytes:
     InputError
         The file cannot be read or is too large.
     """
-    with _open(path) as file:
-        data = file.read(MAX_BYTES + 1)
-    if len(data) > MAX_BYTES:
+    with open_file(path) as file:
+        data = file.read(max_bytes + 1)
+    if len(data) > max_bytes:
         raise InputError(
-            f"{path}: expected a settings file of at most {MAX_BYTES} bytes, got more; is it another file?"
+            f"{path}: expected {kind} of at most {max_bytes} bytes, got more; is it another file?"
         )
     return data
 
@@ -61,31 +64,8 @@ def sha256(path: str | os.PathLike[str]) -> str:
     InputError
         The file cannot be read.
     """
-    with _open(path) as file:
+    with open_file(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-@contextmanager
-def _open(path: str | os.PathLike[str]) -> Iterator[BufferedReader]:
-    """Open a file for reading; a system error becomes an `InputError`."""
-    path = Path(path)
-    try:
-        if not stat.S_ISREG(path.stat().st_mode):
-            raise InputError(
-                f"{path}: expected a file, got a {'folder' if path.is_dir() else 'device or pipe'}"
-            )
-        with path.open("rb") as file:
-            yield file
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: expected a file, there is none; check the path") from error
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
-        raise InputError(f"{path}: cannot be read: {_reason(error)}") from error
-
-
-def _reason(error: Exception) -> str:
-    if isinstance(error, PermissionError):
-        return "permission denied; change the permissions or the user"
-    return getattr(error, "strerror", None) or str(error)
 
 
 def change_mark(path: str | os.PathLike[str]) -> tuple[int, int, int]:
@@ -120,8 +100,10 @@ def unchanged(path: str | os.PathLike[str]) -> Iterator[None]:
     Raises
     ------
     InputError
-        At the end: it was changed or replaced meanwhile.
+        It is no regular file, which could not be read twice; or, at the end, it was changed meanwhile.
     """
+    with open_file(path):
+        pass
     before = change_mark(path)
     yield
     if change_mark(path) != before:
@@ -162,17 +144,17 @@ def atomic_write(path: Path) -> Iterator[IO[bytes]]:
         temporary = None
         sync_folder(target.parent)
     except OSError as error:
-        reason = _reason(error)
+        why = reason(error)
         if not target.parent.is_dir():
-            reason = f"expected the folder {path.parent}, there is none; make it first"
-        raise InputError(f"{path}: cannot be written: {reason}") from error
+            why = f"expected the folder {path.parent}, there is none; make it first"
+        raise InputError(f"{path}: cannot be written: {why}") from error
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
 
 
 def sync_folder(folder: Path) -> None:
-    """Wait until the names in a folder are on the disk.
+    """Wait until the names in a folder are on the disk, where the system can.
 
     Parameters
     ----------
@@ -182,8 +164,10 @@ def sync_folder(folder: Path) -> None:
     Raises
     ------
     OSError
-        The system cannot do it.
+        The folder cannot be read.
     """
+    if not hasattr(os, "O_DIRECTORY"):  # Windows opens no folder
+        return
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)

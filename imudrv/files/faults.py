@@ -28,10 +28,12 @@ _EXPECTED: Final = {
     "less_than": "less than {lt}",
     "less_than_equal": "at most {le}",
     "literal_error": "{expected}",
+    "enum": "{expected}",
     "tuple_type": "a list",
     "list_type": "a list",
     "dict_type": "a mapping (key: value)",
     "model_type": "a mapping (key: value)",
+    "dataclass_type": "a mapping (key: value)",
     "datetime_type": _TIME,
     "datetime_parsing": _TIME,
     "datetime_from_date_parsing": _TIME,
@@ -72,6 +74,8 @@ def validation_faults(error: ValidationError, document: object, model: type[Mode
             advice = model.advice_for_key(keys) or _nearest(str(place[-1]), known)
             advice = advice or f"known are {', '.join(sorted(known))}"
             found[where, f"unknown key; {advice}"] = []
+        elif name == "unexpected_keyword_argument":  # of a dataclass
+            found[where, "unknown key; remove it"] = []
         elif name == "missing" and isinstance(place[-1], int):
             # One error for each absent item of a tuple, in order: the last one gives the length.
             found[_path(place[:-1]), str(len(came))] = [f"{place[-1] + 1} {_plural(came)}"]
@@ -84,6 +88,8 @@ def validation_faults(error: ValidationError, document: object, model: type[Mode
             found[where, str(len(came))] = [f"{limit.format(**values)} {_plural(came)}"]
         elif name == "value_error":
             found |= {(where, fault): [] for fault in str(values["error"]).splitlines()}
+        elif name == "json_invalid":  # half a character; the rest cannot be wrong here
+            found["", "expected Unicode text, got bytes that are none; is the locale UTF-8?"] = []
         elif name in _EXPECTED:
             advice = model.advice_for_value(keys, came) or _advice(name, came, values)
             rest = shown_value(came) + (f"; {advice}" if advice else "")
@@ -154,7 +160,7 @@ def _advice(expected: str, came: object, values: Mapping[str, Any]) -> str:
         return "put it in quotes"
     if expected in ("int_type", "float_type") and isinstance(came, str) and re.fullmatch(_NUMBER, came):
         return "leave out the quotes"
-    if expected == "literal_error" and isinstance(came, str):
+    if expected in ("literal_error", "enum") and isinstance(came, str):
         return _nearest(came, re.findall(r"'([^']*)'", values["expected"]))
     return ""
 

@@ -46,7 +46,7 @@ def file_to_write(path: Path) -> Path:
     except (OSError, ValueError) as error:  # ValueError: a NUL in the path
         raise InputError(f"{path}: cannot be written: {getattr(error, 'strerror', None) or error}") from error
     if not stat.S_ISREG(mode):
-        raise InputError(f"{path}: expected a file, got {_kind(mode)}; choose another name")
+        raise InputError(f"{path}: expected a file, got {kind_of(mode)}; choose another name")
     return Path(os.path.realpath(path))
 
 
@@ -75,7 +75,8 @@ def require_other(path: Path, *inputs: str | Path | None) -> None:
                 )
 
 
-def _kind(mode: int) -> str:
+def kind_of(mode: int) -> str:
+    """Return what is no regular file, by its mode: a folder, a pipe, a socket or a device."""
     for is_kind, name in ((stat.S_ISDIR, "folder"), (stat.S_ISFIFO, "pipe"), (stat.S_ISSOCK, "socket")):
         if is_kind(mode):
             return f"a {name}"

@@ -176,16 +176,44 @@ def write(path: str | os.PathLike[str], document: Model | Mapping[str, object]) 
     path : path-like
         The file.
     document : Model or mapping
-        Its new contents: keys in the model's order, absent options left out, floats exact.
+        Its new contents, see `to_bytes`.
 
     Raises
     ------
     InputError
         It cannot be written, the existing file is too large for a settings file, or see `file_to_write`.
     """
+    replace(path, to_bytes(document))
+
+
+def to_bytes(document: Model | Mapping[str, object]) -> bytes:
+    """Return the content of a settings file.
+
+    Parameters
+    ----------
+    document : Model or mapping
+        Keys in the model's order, without absent options and fields that a model excludes; floats exact.
+
+    Returns
+    -------
+    bytes
+        YAML, UTF-8.
+    """
+    return dump_yaml(_plain(document))
+
+
+def replace(path: str | os.PathLike[str], data: bytes) -> None:
+    """Write the content of a settings file; see `write`.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    data : bytes
+        Its new content.
+    """
     path = Path(path)
     target = file_to_write(path)
-    data = dump_yaml(_plain(document))
     if len(data) > MAX_BYTES:
         raise InputError(
             f"{path}: expected at most {MAX_BYTES} bytes to write, got {len(data)}; shorten the contents"
@@ -210,9 +238,10 @@ def _backup_name(path: Path) -> Path:
 
 
 def _plain(value: object) -> object:
-    """Return models as mappings without absent options, tuples as lists."""
+    """Return models as mappings without absent options and excluded fields, tuples as lists."""
     if isinstance(value, Model):
-        fields = ((name, getattr(value, name)) for name in type(value).model_fields)
+        names = (name for name, field in type(value).model_fields.items() if not field.exclude)
+        fields = ((name, getattr(value, name)) for name in names)
         return {name: _plain(field) for name, field in fields if field is not None}
     if isinstance(value, Mapping):
         return {key: _plain(item) for key, item in value.items()}

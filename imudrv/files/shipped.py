@@ -39,7 +39,7 @@ def find(kind: str, name_or_path: str | os.PathLike[str], folder: Path, known: s
     shipped = names(folder)
     if name in shipped:
         return folder / f"{name}.yaml"
-    if not Path(name).exists():
+    if not os.path.exists(name):
         near = difflib.get_close_matches(name, shipped, 1)
         hint = f"; did you mean {near[0]}?" if near else ""
         raise InputError(

@@ -4,17 +4,21 @@ import errno
 import os
 import time
 from collections.abc import Callable
+from math import inf
 from pathlib import Path
 from threading import Event, Thread
 from typing import Final, NamedTuple
 
 from imudrv.errors import InputError
 from imudrv.files.outputs import file_to_write
+from imudrv.posix import O_BINARY
 
 PERIOD_S: Final = 0.05
 """Period of writing, s."""
 _PAUSE_S: Final = 0.002  # between the pieces of a backlog, so that the loop runs meanwhile
 _CLOSE_TIMEOUT_S: Final = 5.0
+_LOOK_S: Final = 0.5
+"""Period of looking whether the file is still there."""
 _FULL: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -56,6 +60,14 @@ class AppendThread:
         Returns the next piece; called in the thread.
     last_piece : callable
         Returns the end of the file; called in the thread.
+    sync_s : float, optional
+        Have the disk keep what was written at least this often, which a power failure then does not undo; by
+        default the system chooses the time, usually 5 to 30 s.
+
+    Attributes
+    ----------
+    displaced : str
+        What has happened to the file, such as ``deleted``; empty while its name leads to it.
 
     Raises
     ------
@@ -70,10 +82,11 @@ class AppendThread:
         head: bytes,
         next_piece: Callable[[], Piece],
         last_piece: Callable[[], bytes] = bytes,
+        sync_s: float | None = None,
     ) -> None:
-        target = file_to_write(path)
+        self._target = target = file_to_write(path)
         try:
-            self._file = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+            self._file = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL | O_BINARY, 0o666)
         except FileExistsError as error:
             raise InputError(
                 f"{path}: expected a new file, there is one of that name; move it away or take another name"
@@ -82,7 +95,9 @@ class AppendThread:
             raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
         self.sent = 0
         self._size = 0
-        self._trouble = ""
+        self._trouble = self.displaced = ""
+        self._sync_s = inf if sync_s is None else sync_s
+        self._synced = self._looked = time.monotonic()
         if not self._append(head):
             os.close(self._file)
             target.unlink()
@@ -98,7 +113,7 @@ class AppendThread:
         """Current error: ``disk full`` or the message of the system; empty without one."""
         if not self._thread.is_alive() and not self._is_closing.is_set():
             return "the writer has stopped"
-        return self._trouble
+        return self._trouble or (f"{self.displaced} while it was written" if self.displaced else "")
 
     def close(self) -> None:
         """Write what waits, within a few seconds, and close the file."""
@@ -119,9 +134,34 @@ class AppendThread:
                 more, piece = piece.more, _NOTHING
                 if more:
                     time.sleep(_PAUSE_S)
+            self._look_after()
         if not piece.data:
             self._append(self._last_piece())
         os.close(self._file)
+
+    def _look_after(self) -> None:
+        """Look for the file, and have the disk keep it, as often as either is due."""
+        now = time.monotonic()
+        if now - self._looked >= _LOOK_S:
+            self._looked = now
+            self.displaced = self._found()
+        if now - self._synced >= self._sync_s:
+            self._synced = now
+            try:
+                os.fsync(self._file)
+            except OSError as error:
+                self._trouble = (error.strerror or str(error)).lower()
+
+    def _found(self) -> str:
+        """Return what has happened to the file; empty if its name leads to it."""
+        mine = os.fstat(self._file)
+        if not mine.st_nlink:
+            return "deleted"
+        try:
+            is_there = os.path.samestat(os.stat(self._target), mine)
+        except OSError:
+            is_there = False
+        return "" if is_there else "renamed"
 
     def _append(self, piece: bytes) -> bool:
         """Append a piece; return whether it is in the file."""

@@ -5,6 +5,7 @@ needs little memory.
 """
 
 import shutil
+import sys
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -122,12 +123,14 @@ class NpzTable:
         Open for writing.
     folder : Path
         Folder of the temporary files.
+    opened : ExitStack
+        Closes the temporary files.
     """
 
-    def __init__(self, file: IO[bytes], folder: Path) -> None:
+    def __init__(self, file: IO[bytes], folder: Path, opened: ExitStack) -> None:
         self._file = file
         self._folder = folder
-        self._open = ExitStack()
+        self._open = opened
         self._columns: dict[str, tuple[IO[bytes], np.dtype[np.generic], tuple[int, ...]]] = {}
         self._rows = 0
 
@@ -142,7 +145,7 @@ class NpzTable:
 
     def finish(self) -> None:
         """Write the archive."""
-        with self._open, zipfile.ZipFile(self._file, "w", zipfile.ZIP_STORED) as archive:
+        with zipfile.ZipFile(self._file, "w", zipfile.ZIP_STORED) as archive:
             for name, (grown, dtype, shape) in self._columns.items():
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                     header = {"descr": dtype.str, "fortran_order": False, "shape": (self._rows, *shape)}
@@ -205,12 +208,12 @@ def table(path: Path, kinds: Sequence[str], parts: Mapping[str, Sequence[str]]) 
         raise InputError(
             f"{path}: expected a name ending in {', '.join(kinds)}, got {path.suffix or 'no suffix'}"
         )
-    with writing(path) as file:
+    with writing(path) as file, ExitStack() as opened:
         rows: Table
         if suffix == ".csv":
             rows = CsvTable(file, parts)
         elif suffix == ".npz":
-            rows = NpzTable(file, Path(file.name).parent)
+            rows = NpzTable(file, Path(file.name).parent, opened)
         else:
             rows = DatagramTable(file, Source.REPLAY)
         yield rows
@@ -242,6 +245,8 @@ def writing(path: Path) -> Iterator[IO[bytes]]:
         with atomic_write(path) as file:
             yield file
         return
+    if sys.stdout is None:
+        raise InputError("standard output: cannot be written: it is closed")
     try:
         # Its own buffer: data that a full disk does not take must not be written again at exit.
         with open(_STANDARD_OUTPUT, "wb", closefd=False) as file:

@@ -17,7 +17,7 @@ Where a timer delivers samples in bursts, the newest of a burst shows the clock.
 samples more slowly than once in the window hides up to one interval, which the arrivals cannot show.
 """
 
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +34,7 @@ from imudrv.imu.envelope import (
     room_for_points,
 )
 from imudrv.kernels import kernel
-from imudrv.records import Flag, Records, Timebase
+from imudrv.records import PULSES, Flag, Records, Timebase
 from imudrv.units import NS, NS_PER_S, PPM
 
 WINDOW_NS: Final = 90 * NS_PER_S
@@ -47,7 +47,7 @@ STALL_EDGES_S: Final = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
 _EARLY_NS: Final = 5_000_000  # no sample arrives so early: one of the clocks has stepped
 _WAIT: Final = 0.01  # part of an interval by which a stamp that is ahead moves on, while unlocked
 _LATEST_NS: Final = 2**62  # in the year 2116; keeps sums of whatever a recording holds within 64 bits
-_KEPT: Final = 1 << 16  # most stamps that wait for `stamp`, beside those of the last piece
+_KEPT: Final = 1 << 16  # most stamps that wait for `stamp`, besides those of the last piece
 _ROOM: Final = 1 << 12
 _EDGES_NS: Final = tuple(round(edge * NS_PER_S) for edge in STALL_EDGES_S)
 _UNLOCKED: Final = int(Flag.CLOCK_UNLOCKED)
@@ -76,6 +76,8 @@ STATE: Final = np.dtype(
         ("stepped", np.bool_),  # the next sample is the first of another timebase
         ("woken", np.bool_),  # it is the first after a suspend
         ("steps", np.int64),
+        ("taken", np.int64),  # stamps that `stamp` has used,
+        ("fed", np.int64),  # and end of those that are known
     ],
     align=True,
 )
@@ -91,6 +93,9 @@ STAMP: Final = np.dtype(
     align=True,
 )
 """Times of a sample."""
+
+ClockArrays: TypeAlias = tuple[Records, Records, NDArray[np.int64], Records]
+"""Constants, state, points of the envelope, stamps."""
 
 
 class ClockReport(NamedTuple):
@@ -146,7 +151,6 @@ class ClockModel:
         self._state = np.zeros(1, STATE)
         self._points = room_for_points(WINDOW_NS)
         self._stamps = np.empty(_ROOM, STAMP)
-        self._taken = self._fed = 0
         self._timebase = Timebase()
 
     def follow(self, timebase: Timebase) -> None:
@@ -167,6 +171,21 @@ class ClockModel:
         s["offset_ns"] = timebase.offset_ns
         self._timebase = timebase
 
+    @property
+    def arrays(self) -> ClockArrays:
+        """Arguments of `feed_clock` and `stamp`; valid until `reserve` makes room."""
+        return self._constants, self._state, self._points, self._stamps
+
+    def reserve(self, samples: int) -> None:
+        """Make room for the stamps of so many samples, in addition to those that wait."""
+        s = self._state[0]
+        waiting = self._stamps[max(s["taken"], s["fed"] - _KEPT) : s["fed"]]
+        needed = len(waiting) + samples
+        if needed > len(self._stamps):
+            self._stamps = np.empty(2 * needed, STAMP)
+            self._stamps[: len(waiting)] = waiting
+            s["taken"], s["fed"] = 0, len(waiting)
+
     def feed(self, pulses: Records) -> Records:
         """Stamp samples.
 
@@ -180,11 +199,10 @@ class ClockModel:
         ndarray of STAMP
             One for each sample.
         """
-        if self._fed + len(pulses) > len(self._stamps):
-            self._make_room(len(pulses))
-        stamps = self._stamps[self._fed : self._fed + len(pulses)]
-        _feed(pulses, stamps, self._constants, self._state, self._points)
-        self._fed += len(pulses)
+        self.reserve(len(pulses))
+        feed_clock(pulses.view(PULSES), *self.arrays)
+        stop = int(self._state[0]["fed"])
+        stamps: Records = self._stamps[stop - len(pulses) : stop].copy()
         return stamps
 
     def stamp(self, increments: Records) -> Records:
@@ -206,10 +224,7 @@ class ClockModel:
         ValueError
             Increments of samples that were never fed, or were stamped before.
         """
-        taken = _stamp(increments, self._stamps, self._taken, self._fed)
-        if taken < 0:
-            raise ValueError("expected increments of the samples fed, in their order, each once; got another")
-        self._taken = taken
+        stamp(increments, *self.arrays)
         return increments
 
     @property
@@ -227,13 +242,6 @@ class ClockModel:
             steps=int(s["steps"]),
         )
 
-    def _make_room(self, count: int) -> None:
-        """Move queued stamps to a new array, with room for `count` more; returned stamps keep the old one."""
-        waiting = self._stamps[max(self._taken, self._fed - _KEPT) : self._fed]
-        self._stamps = np.empty(max(_ROOM, 2 * (len(waiting) + count)), STAMP)
-        self._stamps[: len(waiting)] = waiting
-        self._taken, self._fed = 0, len(waiting)
-
 
 class _Place(NamedTuple):
     """A sample against the origin of the envelope, ns."""
@@ -244,12 +252,22 @@ class _Place(NamedTuple):
 
 
 @kernel
-def _feed(
-    pulses: Records, stamps: Records, constants: Records, state: Records, points: NDArray[np.int64]
+def feed_clock(
+    pulses: Records, constants: Records, state: Records, points: NDArray[np.int64], stamps: Records
 ) -> None:
-    """Stamp samples."""
+    """Stamp samples; the stamps wait for `stamp`.
+
+    Parameters
+    ----------
+    pulses : ndarray of PULSES
+        In order.
+    constants, state, points, stamps
+        `ClockModel.arrays`, with room for them.
+    """
     c, s = constants[0], state[0]
     e = s["envelope"]
+    if s["fed"] + len(pulses) > len(stamps):
+        _move_to_the_beginning(stamps, len(pulses), s)
     for i in range(len(pulses)):
         sample = pulses[i]
         dx, x, y = _place(sample, c, s, points)
@@ -264,10 +282,20 @@ def _feed(
         if s["locked"]:
             _count_stall(y - on_line, s)
         s["t_ns"] = sample["elapsed_ns"] + s["origin_y"] + np.int64(np.rint(on_line + s["ahead"]))
-        stamp = stamps[i]
-        stamp["elapsed_ns"], stamp["t_ns"] = sample["elapsed_ns"], s["t_ns"] + s["offset_ns"]
-        stamp["locked"], stamp["stepped"] = s["locked"], s["stepped"]
+        row = stamps[s["fed"]]
+        row["elapsed_ns"], row["t_ns"] = sample["elapsed_ns"], s["t_ns"] + s["offset_ns"]
+        row["locked"], row["stepped"] = s["locked"], s["stepped"]
         s["stepped"] = False
+        s["fed"] += 1
+
+
+@kernel
+def _move_to_the_beginning(stamps: Records, samples: int, s: np.void) -> None:
+    """Make room for the stamps of so many samples: only the latest of those that wait stay."""
+    first = max(s["taken"], s["fed"] + samples - len(stamps))
+    for k in range(s["fed"] - first):
+        stamps[k] = stamps[first + k]
+    s["taken"], s["fed"] = 0, s["fed"] - first
 
 
 @kernel
@@ -325,8 +353,25 @@ def _count_stall(delay_ns: float, s: np.void) -> None:
 
 
 @kernel
-def _stamp(increments: Records, stamps: Records, taken: int, fed: int) -> int:
-    """Replace times by the counter with stamps; return the first stamp not taken, -1 for an unknown time."""
+def stamp(
+    increments: Records, constants: Records, state: Records, points: NDArray[np.int64], stamps: Records
+) -> None:
+    """Replace times by the counter with stamps.
+
+    Parameters
+    ----------
+    increments : ndarray of INCREMENTS
+        See `ClockModel.stamp`.
+    constants, state, points, stamps
+        `ClockModel.arrays`.
+
+    Raises
+    ------
+    ValueError
+        See `ClockModel.stamp`.
+    """
+    s = state[0]
+    taken, fed = s["taken"], s["fed"]
     for i in range(len(increments)):
         increment = increments[i]
         stepped = False
@@ -334,11 +379,11 @@ def _stamp(increments: Records, stamps: Records, taken: int, fed: int) -> int:
             stepped |= stamps[taken]["stepped"]
             taken += 1
         if taken == fed:
-            return -1
+            raise ValueError("expected increments of the samples fed, in their order, each once; got another")
         increment["t_ns"] = stamps[taken]["t_ns"]
         if not stamps[taken]["locked"]:
             increment["flags"] |= _UNLOCKED
         if stepped or stamps[taken]["stepped"]:
             increment["flags"] |= _STEPPED
         taken += 1
-    return taken
+    s["taken"] = taken

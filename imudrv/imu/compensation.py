@@ -12,7 +12,7 @@ not stay in velocity.
 """
 
 from dataclasses import replace
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ from imudrv.imu.rate_filter import RateFilter, RateFilterName
 from imudrv.imu.rate_filter import rate_filter as make_filter
 from imudrv.imu.size_effect import SIZE_EFFECT, SizeEffect, dv_r, size_effect_constants, unpack_size_effect
 from imudrv.kernels import kernel
-from imudrv.records import INCREMENTS, Flag, Records
+from imudrv.records import INCREMENTS, PULSES, Flag, Records
 from imudrv.units import NS
 from imudrv.vectors import Matrix, Vector, add, matrix, put, rotate, row, scale, subtract, times, vector_at
 from imudrv.wire.layout import Layout
@@ -34,6 +34,8 @@ MAX_TAPS: Final = 32
 
 CONSTANTS: Final = np.dtype(
     [
+        ("gyro_in_pulses", np.bool_),  # otherwise the bits of a float64
+        ("accelerometer_in_pulses", np.bool_),
         ("gyro_scale", np.float64, 3),  # rad per pulse
         ("gyro_bias", np.float64, 3),  # rad/s, body axes
         ("C_bg", np.float64, (3, 3)),
@@ -54,6 +56,11 @@ CONSTANTS: Final = np.dtype(
         ("interval_ns", np.int64),  # of one sample
         ("lag", np.int64),  # of the rate filter, samples
         ("length", np.int64),  # of its taps
+        ("lacks_axes", np.bool_),  # the unit has no gyro or accelerometer in some axes
+        ("lacks_gyro", np.int64, 3),  # 1 for such an axis,
+        ("lacks_accelerometer", np.int64, 3),
+        ("lacks_dtheta_b", np.int64, 3),  # and for the axes of the body that it would be a part of
+        ("lacks_dv_b", np.int64, 3),
         ("taps", np.float64, MAX_TAPS),  # 1/s, oldest first
     ],
     align=True,
@@ -68,12 +75,15 @@ STATE: Final = np.dtype(
         ("rate", np.float64, 3),  # at the end of the last finished row, rad/s
         ("slot", np.int64),  # of the oldest part in `history`
         ("history", np.float64, (2 * MAX_TAPS, 3)),  # angles of the latest parts, see `_remember`
+        ("waiting", np.int64),  # increments whose rates are not known yet
     ],
     align=True,
 )
 """State of the kernels between calls."""
 
-_NOTHING: Final = np.zeros(0, INCREMENTS)
+CompensatorArrays: TypeAlias = tuple[Records, Records, Records]
+"""Constants, state, increments that wait."""
+
 _ZERO: Final = (0.0, 0.0, 0.0)
 _MISSING_BEFORE: Final = int(Flag.MISSING_BEFORE)
 _TEMPERATURE_RANGE: Final = int(Flag.TEMPERATURE_RANGE)
@@ -106,18 +116,16 @@ class Compensator:
         gyro, accelerometer = layout.missing_axes
         if gyro or len(accelerometer) == 3:
             coefficients = replace(coefficients, r_b=None)  # the size effect needs all angular rates
-        self._missing = [
-            (name, axes, out, C[:, axes].any(axis=1))
-            for name, axes, out, C in (
-                ("gyro", gyro, "dtheta_b", np.asarray(coefficients.C_bg)),
-                ("accelerometer", accelerometer, "dv_b", np.asarray(coefficients.C_ba)),
-            )
-            if axes
-        ]
         self.has_size_effect = coefficients.r_b is not None
+        self._samples_type = layout.samples_type
         self._constants = _constants(coefficients, layout, make_filter(rate_filter, layout.interval_ns))
         self._state = np.zeros(1, STATE)
-        self._waiting = _NOTHING
+        self._waiting = np.zeros(MAX_TAPS, INCREMENTS)
+
+    @property
+    def arrays(self) -> CompensatorArrays:
+        """Arguments of `compensate`."""
+        return self._constants, self._state, self._waiting
 
     @property
     def lag(self) -> int:
@@ -138,17 +146,9 @@ class Compensator:
             Those that are ready; `t_ns` is the time by the counter, `elapsed_ns` of the pulses. NaN for a
             body axis that an axis missing in the unit is a part of.
         """
-        if self._missing:
-            pulses = pulses.copy()
-            for name, axes, _, _ in self._missing:
-                pulses[name][:, axes] = 0
-        waiting = len(self._waiting)
-        out = np.empty(waiting + len(pulses), INCREMENTS)
-        if waiting:
-            out[:waiting] = self._waiting
-        ready = _compensate(pulses, out, waiting, self._constants, self._state)
-        self._waiting = out[ready:].copy() if ready < len(out) else _NOTHING
-        return self._without_missing(out[:ready])
+        out = np.empty(int(self._state[0]["waiting"]) + len(pulses), INCREMENTS)
+        pulses = pulses.astype(self._samples_type, copy=False).view(PULSES)
+        return out[: compensate(pulses, *self.arrays, out)]
 
     def close(self) -> Records:
         """End the stream.
@@ -158,16 +158,10 @@ class Compensator:
         ndarray of INCREMENTS
             Those that still waited for a rate, without size-effect compensation.
         """
-        rest, self._waiting = self._waiting, _NOTHING
-        _finish_plainly(rest, matrix(self._constants[0]["C_ba"]))
-        self._state = np.zeros(1, STATE)
-        return self._without_missing(rest)
-
-    def _without_missing(self, increments: Records) -> Records:
-        """Set to NaN what an axis that the unit lacks would be a part of."""
-        for _, _, out, axes_b in self._missing:
-            increments[out][:, axes_b] = np.nan
-        return increments
+        rest: Records = self._waiting[: self._state[0]["waiting"]].copy()
+        _close(rest, self._constants)
+        self._state[:] = np.zeros(1, STATE)
+        return rest
 
 
 def require_sensors(coefficients: Coefficients, layout: Layout) -> None:
@@ -202,6 +196,8 @@ def _constants(c: Coefficients, layout: Layout, rate_filter: RateFilter) -> Reco
     """Fill in the one row of `CONSTANTS`."""
     constants = np.zeros(1, CONSTANTS)
     k = constants[0]
+    k["gyro_in_pulses"] = layout.gyro.is_counted
+    k["accelerometer_in_pulses"] = layout.accelerometer.is_counted
     k["gyro_scale"], k["gyro_bias"], k["C_bg"] = c.gyro_scale, c.gyro_bias, c.C_bg
     k["accelerometer_scale"], k["accelerometer_bias"] = c.accelerometer_scale, c.accelerometer_bias
     k["C_ba"] = c.C_ba
@@ -220,6 +216,16 @@ def _constants(c: Coefficients, layout: Layout, rate_filter: RateFilter) -> Reco
         mean_of_ends_s = interval_s if rate_filter.middle_from_ends else 0.0
         k["has_size_effect"] = True
         k["size_effect"] = size_effect_constants(c.C_ba, c.r_b, mean_of_ends_s)[0]
+    for sensor, axes, out, C in zip(
+        ("lacks_gyro", "lacks_accelerometer"),
+        layout.missing_axes,
+        ("lacks_dtheta_b", "lacks_dv_b"),
+        (np.asarray(c.C_bg), np.asarray(c.C_ba)),
+        strict=True,
+    ):
+        k["lacks_axes"] |= bool(axes)
+        k[sensor][axes] = 1
+        k[out] = C[:, axes].any(axis=1)
     return constants
 
 
@@ -245,17 +251,71 @@ class _AtTemperature(NamedTuple):
 
 
 @kernel
-def _compensate(pulses: Records, out: Records, waiting: int, constants: Records, state: Records) -> int:
-    """Append an increment for each of the pulses to the `waiting` ones in `out`; return how many are ready.
+def compensate(
+    pulses: Records, constants: Records, state: Records, waiting: Records, increments: Records
+) -> int:
+    """Compensate pulses.
 
-    The `dv_b` of a row that waits for its rate still is on the axes of the accelerometers.
+    The `dv_b` of an increment that waits for its rate still is on the axes of the accelerometers.
+
+    Parameters
+    ----------
+    pulses : ndarray of PULSES
+        In order.
+    constants, state, waiting
+        `Compensator.arrays`.
+    increments : ndarray of INCREMENTS
+        Receives those that waited and one for each of the pulses.
+
+    Returns
+    -------
+    int
+        Number of increments that are ready; the others wait.
     """
     c, s = constants[0], state[0]
-    _scale(pulses, out[waiting:], c)
+    count = s["waiting"]
+    for k in range(count):
+        increments[k] = waiting[k]
+    out = increments[: count + len(pulses)]
+    _scale(pulses, out[count:], c)
     if c["has_size_effect"]:
-        return _remove_size_effect(out, waiting, c, s)
-    _finish_plainly(out, matrix(c["C_ba"]))
-    return len(out)
+        ready = _remove_size_effect(out, count, c, s)
+    else:
+        _finish_plainly(out, matrix(c["C_ba"]))
+        ready = len(out)
+    s["waiting"] = len(out) - ready
+    for k in range(s["waiting"]):
+        waiting[k] = out[ready + k]
+    if c["lacks_axes"]:
+        _remove_lacking(out[:ready], c)
+    return ready
+
+
+@kernel
+def _close(rest: Records, constants: Records) -> None:
+    """Finish the increments that wait, at the end of the stream."""
+    c = constants[0]
+    _finish_plainly(rest, matrix(c["C_ba"]))
+    if c["lacks_axes"]:
+        _remove_lacking(rest, c)
+
+
+@kernel
+def _present(values: Vector, lacks: NDArray[np.int64]) -> Vector:
+    """Return the increments of a sensor, 0 where the unit lacks the axis."""
+    x, y, z = values
+    return 0.0 if lacks[0] else x, 0.0 if lacks[1] else y, 0.0 if lacks[2] else z
+
+
+@kernel
+def _remove_lacking(increments: Records, c: np.void) -> None:
+    """Set to NaN what an axis that the unit lacks would be a part of."""
+    for i in range(len(increments)):
+        for axis in range(3):
+            if c["lacks_dtheta_b"][axis]:
+                increments[i]["dtheta_b"][axis] = np.nan
+            if c["lacks_dv_b"][axis]:
+                increments[i]["dv_b"][axis] = np.nan
 
 
 @kernel
@@ -272,8 +332,12 @@ def _scale(pulses: Records, out: Records, c: np.void) -> None:
         if _differ(sample["temperature_degc"], degc, channels):
             degc = sample["temperature_degc"]
             at = _at_temperature(degc, c)
-        gyro = times(vector_at(sample["gyro"], 0), at.gyro_scale)
-        accelerometer = times(vector_at(sample["accelerometer"], 0), at.accelerometer_scale)
+        gyro = _numbers(sample["gyro"], c["gyro_in_pulses"])
+        accelerometer = _numbers(sample["accelerometer"], c["accelerometer_in_pulses"])
+        if c["lacks_axes"]:
+            gyro = _present(gyro, c["lacks_gyro"])
+            accelerometer = _present(accelerometer, c["lacks_accelerometer"])
+        gyro, accelerometer = times(gyro, at.gyro_scale), times(accelerometer, at.accelerometer_scale)
         put(increment["dtheta_b"], 0, subtract(rotate(C_bg, gyro), scale(T, at.gyro_bias)))
         put(increment["dv_b"], 0, subtract(accelerometer, scale(T, at.accelerometer_bias)))
         increment["counter"], increment["t_ns"] = sample["counter"], sample["elapsed_ns"]
@@ -281,6 +345,18 @@ def _scale(pulses: Records, out: Records, c: np.void) -> None:
             increment["counter"] //= c["counter_step"]
         increment["interval_ns"] = sample["interval_ns"]
         increment["flags"] = sample["flags"] if at.in_range else sample["flags"] | _TEMPERATURE_RANGE
+
+
+@kernel
+def _numbers(a: NDArray[np.int64], in_pulses: bool) -> Vector:
+    """Return the increments of a sensor: pulses, or other numbers from their bits."""
+    if in_pulses:
+        return float(a[0]), float(a[1]), float(a[2])
+    return (
+        float(np.int64(a[0]).view(np.float64)),
+        float(np.int64(a[1]).view(np.float64)),
+        float(np.int64(a[2]).view(np.float64)),
+    )
 
 
 @kernel

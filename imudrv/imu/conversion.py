@@ -17,7 +17,6 @@ from imudrv.wire.fields import ahead_of
 from imudrv.wire.layout import NARROW_BITS, Field, Layout, Sensor, SequenceKind, Values
 
 Array = NDArray[np.int64]
-Numbers = NDArray[np.int64] | NDArray[np.float64]
 
 MAX_INTERVAL_NS: Final = 2**32 - 1
 """Longest interval that the output datagram can carry; a longer gap in totals is not recovered."""
@@ -152,7 +151,7 @@ def convert_increments(frame: np.void, c: np.void, interval_ns: int, out: np.voi
 
 
 @kernel
-def _convert(counts: Array, sensor: np.void, T: float, out: Numbers) -> bool:
+def _convert(counts: Array, sensor: np.void, T: float, out: Array) -> bool:
     """Set the increments of one sensor over an interval; return whether all are inside their limits.
 
     A floating-point number has no limit but must be finite.
@@ -172,7 +171,7 @@ def _convert(counts: Array, sensor: np.void, T: float, out: Numbers) -> bool:
         else:
             number = float(counts[axis])
             inside &= sensor["lowest"][axis] < counts[axis] < sensor["highest"][axis]
-        out[axis] = number * sensor["per_count"][axis] * factor
+        out[axis] = np.float64(number * sensor["per_count"][axis] * factor).view(np.int64)
     return inside
 
 
@@ -217,18 +216,21 @@ def convert_totals(
 
 
 @kernel
-def _subtract(total: Array, latest: Array, rate: Array, steps: int, sensor: np.void, out: Numbers) -> bool:
+def _subtract(total: Array, latest: Array, rate: Array, steps: int, sensor: np.void, out: Array) -> bool:
     """Set the increments of one sensor, and their rate; return whether they are unambiguous."""
     sure = True
     for axis in range(3):
         if sensor["is_float"][axis]:
             difference = np.int64(total[axis]).view(np.float64) - np.int64(latest[axis]).view(np.float64)
-            out[axis] = difference * sensor["per_count"][axis]
+            out[axis] = np.float64(difference * sensor["per_count"][axis]).view(np.int64)
             sure &= np.isfinite(difference)
             continue
         bits = sensor["bits"][axis]
         counts = ahead_of(total[axis], latest[axis], bits)
-        out[axis] = counts if sensor["in_pulses"] else counts * sensor["per_count"][axis]
+        if sensor["in_pulses"]:
+            out[axis] = counts
+        else:
+            out[axis] = np.float64(counts * sensor["per_count"][axis]).view(np.int64)
         if steps == 1:
             rate[axis] = counts
             continue

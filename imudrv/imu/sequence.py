@@ -19,14 +19,14 @@ gap has its smallest length, and a flag.
 """
 
 from dataclasses import dataclass, fields
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 
 from imudrv.imu.arrivals import ARRIVALS, missing_periods
 from imudrv.imu.conversion import TOTALS, constants, convert_increments, convert_status, convert_totals
 from imudrv.kernels import kernel
-from imudrv.records import FRAME, Flag, Records, samples_type
+from imudrv.records import FRAME, PULSES, Flag, Records
 from imudrv.wire.fields import ahead_of
 from imudrv.wire.layout import Layout, SequenceKind
 
@@ -100,12 +100,16 @@ STATE: Final = np.dtype(
         ("damaged", np.int64),  # frames' worth of bytes, and frames with an invalid counter, since `newest`
         ("torn", np.int64),  # samples given up before those frames
         ("totals", TOTALS),
+        ("waits", np.bool_),  # a frame waits for the next one,
+        ("waiting", FRAME),  # this one
     ],
     align=True,
 )
 """State of the kernels between calls."""
 
-_NONE: Final = np.zeros(0, FRAME)
+TrackerArrays: TypeAlias = tuple[Records, Records, Records]
+"""Constants, state, counts."""
+
 _WRAPS_BY_TIME: Final = 24
 """A counter of up to this many bits may have gone round in a silence that a service survives."""
 _LONGEST: Final = 1 << 31  # a jump forward by more samples is a restart
@@ -121,23 +125,31 @@ class SequenceTracker:
     ----------
     layout : Layout
         Layout of the profile.
+
+    Attributes
+    ----------
+    samples_type : dtype
+        Type of its samples, see `imudrv.records.samples_type`.
     """
 
     def __init__(self, layout: Layout) -> None:
-        gyro, accelerometer = layout.sensors
-        self._type = samples_type(gyro_pulses=gyro.is_counted, accelerometer_pulses=accelerometer.is_counted)
+        self.samples_type = layout.samples_type
         self._constants = constants(layout)
         self._state = np.zeros(1, STATE)
         self._counts = np.zeros(1, COUNTS)
-        self._waiting = _NONE
 
     @property
     def counts(self) -> SampleCounts:
         """Sample counts so far; a frame that still waits counts as one with an invalid counter."""
         counts = self._counts.copy()
-        counts["frames"] += self._waiting.size
-        counts["invalid_counter"] += self._waiting.size
+        counts["frames"] += self._state["waits"]
+        counts["invalid_counter"] += self._state["waits"]
         return SampleCounts(*counts[0].tolist())
+
+    @property
+    def arrays(self) -> TrackerArrays:
+        """Arguments of `track`."""
+        return self._constants, self._state, self._counts
 
     def feed(self, frames: Records) -> Records:
         """Account for frames and convert them to increments.
@@ -153,19 +165,30 @@ class SequenceTracker:
         ndarray of `imudrv.records.samples_type`
             One for each good frame: PULSES, or increments in rad and m/s.
         """
-        if self._waiting.size:
-            frames = np.concatenate([self._waiting, frames])
-        pulses = np.zeros(len(frames), self._type)
-        good, waits = _track(frames, pulses, self._constants, self._state, self._counts)
-        self._waiting = frames[-1:].copy() if waits else _NONE
-        return pulses[:good]
+        if self._state[0]["waits"]:
+            frames = np.concatenate([self._state["waiting"], frames])
+        pulses = np.empty(len(frames), self.samples_type)
+        return pulses[: track(frames, *self.arrays, pulses.view(PULSES))]
 
 
 @kernel
-def _track(
-    frames: Records, samples: Records, constants: Records, state: Records, counts: Records
-) -> tuple[int, bool]:
-    """Account for frames; return the number of samples, and whether the last frame waits for the next."""
+def track(frames: Records, constants: Records, state: Records, counts: Records, samples: Records) -> int:
+    """Account for frames.
+
+    Parameters
+    ----------
+    frames : ndarray of FRAME
+        If one `waits` by the state, that and at least one more.
+    constants, state, counts
+        `SequenceTracker.arrays`.
+    samples : ndarray of PULSES
+        Receives the samples, one for each good frame.
+
+    Returns
+    -------
+    int
+        Number of samples.
+    """
     c, s, n = constants[0], state[0], counts[0]
     always_forward = c["narrow"] or c["sequence"] == SequenceKind.NONE
     good = 0
@@ -180,7 +203,8 @@ def _track(
             ahead = _ahead(frame, c, s)
             if s["started"] and (ahead <= -WINDOW or ahead > WINDOW):
                 if i + 1 == len(frames):
-                    return good, True
+                    s["waits"], s["waiting"] = True, frame
+                    return good
                 if abs(_samples(_ticks(frames[i + 1], frame["counter"], c), c)) > WINDOW:
                     n["frames"] += 1
                     n["invalid_counter"] += 1
@@ -218,7 +242,9 @@ def _track(
         convert_status(frame, c, out)
         n["good"] += 1
         good += 1
-    return good, False
+    if len(frames):
+        s["waits"] = False
+    return good
 
 
 @kernel

@@ -1,12 +1,16 @@
 """Interface of a port, the source of wire bytes or CAN messages with their times of arrival."""
 
+import os
 from abc import ABC, abstractmethod
-from typing import NamedTuple, Self
+from typing import Final, NamedTuple, Self
 
 from imudrv.errors import Imu50Error, InputError
 from imudrv.profiles.schema import Profile
 from imudrv.records import Arrival, Source
 from imudrv.url import Url
+
+OTHER_END_GONE: Final = -1
+"""Error of a port that was ready and gave no bytes."""
 
 
 class PortLostError(Imu50Error):
@@ -83,6 +87,23 @@ class Port(ABC):
         PortEndedError
             There are no more data.
         """
+
+    @property
+    def descriptor(self) -> int | None:
+        """Descriptor that gives wire bytes, or frames of SocketCAN, without blocking; None if none does."""
+        return None
+
+    def fault(self, error: int) -> PortLostError:
+        """Return the loss that an error means which the reader of the descriptor has received.
+
+        Parameters
+        ----------
+        error : int
+            Error of the system, `OTHER_END_GONE`, or another negative number of the port's own.
+        """
+        if error == OTHER_END_GONE:
+            return PortLostError(f"{self.url}: the other end has gone")
+        return PortLostError(f"{self.url}: the port is gone: {os.strerror(error)}")
 
     def line_errors(self) -> LineErrors:
         """Return the errors that the driver has counted; zeros where it does not count."""

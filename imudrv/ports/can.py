@@ -12,27 +12,23 @@ from pathlib import Path
 from typing import Any, Final
 
 import can
-import numpy as np
 
+from imudrv import system
 from imudrv.errors import InputError
 from imudrv.files import settings_file
-from imudrv.hostclock import now_ns
-from imudrv.ports.base import Port, PortLostError, require_transport
+from imudrv.ports.base import PortLostError, require_transport
+from imudrv.ports.can_port import ID_MASK, CanPort, in_words
 from imudrv.ports.serial import explain
+from imudrv.ports.socketcan import SocketcanPort
 from imudrv.profiles.schema import CanLine, Profile
-from imudrv.records import EXTENDED, MESSAGE, MESSAGE_ROW, Arrival, Records, Source
+from imudrv.records import EXTENDED
 from imudrv.url import Url, value
 
 # Our messages contain what python-can logs; without a handler it would go to the terminal.
 logging.getLogger("can").addHandler(logging.NullHandler())
 
-_AT_ONCE: Final = 4096
-"""Maximum number of messages of one read."""
 _BUFFER_BYTES: Final = 1 << 22
 """Receive buffer requested for a socket; the usual 200 kB hold only 0.1 s of messages."""
-_ID_MASK: Final = 0x1FFFFFFF
-_BUS_OFF: Final = 0x40
-"""Bit in the identifier of an error frame (linux/can/error.h)."""
 _RESERVED: Final = ("interface", "channel", "can_filters", "config_context", "ignore_config", "timing")
 _TIMED: Final = ("pcan", "slcan")
 """Interfaces that take a data bit rate only as a complete bit timing."""
@@ -80,84 +76,13 @@ def prepare(url: Url, profile: Profile) -> "Callable[[], CanPort]":
     options |= _rates(url, interface, line, fd)
     filters = [
         {
-            "can_id": kind.can_id & _ID_MASK,
-            "can_mask": kind.can_mask & _ID_MASK,
+            "can_id": kind.can_id & ID_MASK,
+            "can_mask": kind.can_mask & ID_MASK,
             "extended": bool(kind.can_id & EXTENDED),
         }
         for kind in profile.layout().messages
     ]
     return partial(_open, url.text, interface, channel, {**options, "can_filters": filters})
-
-
-class CanPort(Port):
-    """CAN bus; error and remote frames are dropped.
-
-    Parameters
-    ----------
-    url : str
-        As the user gave it.
-    bus : can.BusABC
-        Open bus, shut down by `close`.
-    """
-
-    def __init__(self, url: str, bus: can.BusABC) -> None:
-        super().__init__(url, Source.HARDWARE)
-        self.bus = bus
-        self._closed = False
-
-    def read(self, timeout_s: float) -> Arrival:
-        """See `Port.read`; each message has its own time of arrival."""
-        if self._closed:
-            raise PortLostError(f"{self.url}: the port is closed")
-        rows = []
-        message = self._receive(timeout_s)
-        while message is not None:
-            if message.is_error_frame:
-                if message.arbitration_id & _BUS_OFF:
-                    raise self._bus_off()
-            elif not message.is_remote_frame:
-                data, identifier = message.data, message.arbitration_id & _ID_MASK
-                identifier |= EXTENDED * message.is_extended_id
-                rows.append(MESSAGE_ROW.pack(now_ns(), identifier, len(data), message.is_fd, data))
-            message = self._receive(0) if len(rows) < _AT_ONCE else None
-        if not rows and self._is_off():
-            raise self._bus_off()
-        # A bytearray: arrays over bytes are read-only, which is another type for the kernels.
-        messages: Records = np.frombuffer(bytearray().join(rows), MESSAGE)
-        return Arrival(now_ns(), messages)
-
-    def close(self) -> None:
-        """See `Port.close`."""
-        if self._closed:
-            return
-        self._closed = True
-        with suppress(Exception):  # a driver may raise anything
-            self.bus.shutdown()
-        # If a serial adapter is unplugged, shutdown fails to stop it and does not close the device.
-        device = getattr(self.bus, "serialPortOrig", None)
-        if device is not None:
-            device.close()
-
-    def _is_off(self) -> bool:
-        try:
-            return self.bus.state is can.BusState.ERROR
-        except NotImplementedError:
-            return False
-        except Exception as error:  # a driver may raise anything
-            raise PortLostError(f"{self.url}: {_in_words(error)}") from error
-
-    def _bus_off(self) -> PortLostError:
-        return PortLostError(f"{self.url}: the controller is bus-off; check wiring and bit rate")
-
-    def _receive(self, timeout_s: float) -> can.Message | None:
-        try:
-            return self.bus.recv(timeout_s)
-        except (ValueError, IndexError):
-            return None  # a line of the adapter that is no message
-        except Exception as error:  # a driver may raise anything
-            if str(error) == "could not unpack received message":
-                return None  # a datagram of another program
-            raise PortLostError(f"{self.url}: {_in_words(error)}") from error
 
 
 def _rates(url: Url, interface: str, line: CanLine, fd: bool) -> dict[str, Any]:
@@ -186,6 +111,8 @@ def _open(url: str, interface: str, channel: str, options: dict[str, Any]) -> Ca
             raise InputError(f"{url}: {error}") from error
         raise PortLostError(f"{url}: {_why_not(interface, channel, error)}") from error
     _enlarge_buffer(bus)
+    if interface == "socketcan" and system.IS_AVAILABLE:
+        return SocketcanPort(url, bus)
     return CanPort(url, bus)
 
 
@@ -206,7 +133,7 @@ def _why_not(interface: str, channel: str, error: Exception) -> str:
             return f"there is no CAN interface {channel}; {_interfaces_there_are()}"
         if error.errno == errno.EAFNOSUPPORT:
             return "the kernel has no CAN support (module can_raw)"
-    return f"cannot open it: {_in_words(error)}"
+    return f"cannot open it: {in_words(error)}"
 
 
 def _interfaces_there_are() -> str:
@@ -215,12 +142,3 @@ def _interfaces_there_are() -> str:
     return (
         f"there are {', '.join(names)}" if names else "there is no CAN interface: is the adapter plugged in?"
     )
-
-
-def _in_words(error: Exception) -> str:
-    code = error.error_code if isinstance(error, can.CanError) else getattr(error, "errno", None)
-    if code == errno.ENETDOWN:
-        return "the CAN interface is down; `sudo ip link set NAME up type can bitrate RATE`"
-    cause = error.__cause__
-    text = getattr(error, "strerror", None) or str(error) or type(error).__name__
-    return f"{text}: {cause}" if isinstance(cause, OSError) and str(cause) not in text else text

@@ -20,6 +20,7 @@ from typing import Final
 import numpy as np
 
 from imudrv.errors import InputError
+from imudrv.files.inputs import open_file
 from imudrv.hostclock import now_ns
 from imudrv.ports.base import Port, PortEndedError, PortLostError
 from imudrv.profiles.schema import Profile
@@ -66,15 +67,9 @@ def prepare(url: Url, profile: Profile) -> Callable[[], Port]:
             f"{url.text}: expected no option but {' and '.join(options)}, got {', '.join(unknown)}"
         )
     speed = speed_of(url.options.get("speed", "1"))
-    try:
-        with path.open("rb") as file:
-            empty = not file.read(1)
-    except OSError as error:
-        raise InputError(
-            f"{url.text}: expected a file to replay, cannot read it: {error.strerror}"
-        ) from error
-    if empty:
-        raise InputError(f"{url.text}: expected a file to replay, got an empty one")
+    with open_file(path) as file:
+        if not file.read(1):
+            raise InputError(f"{url.text}: expected a file to replay, got an empty one")
     return partial(_open, url.text, path, layout, speed, url.options.get("channel"))
 
 
@@ -188,8 +183,4 @@ def _log(path: Path, layout: Layout, step_ns: int | None, channel: str | None) -
 def _recording(path: Path, layout: Layout) -> Pieces:
     from imudrv.recording.reader import Recording
 
-    for arrival in Recording(path).arrivals():
-        if isinstance(arrival.data, bytes) == layout.can:
-            came = "bytes of a serial line" if layout.can else "CAN messages"
-            raise InputError(f"{path}: expected a recording for profile {layout.name}, got one of {came}")
-        yield arrival
+    yield from Recording(path).arrivals(layout)

@@ -5,12 +5,10 @@ the lowest latency; other devices are read by pyserial.
 """
 
 import errno
-import fcntl
 import os
 import select
 import socket
 import struct
-import termios
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
@@ -23,8 +21,10 @@ from serial.tools.list_ports import comports
 
 from imudrv.errors import InputError
 from imudrv.hostclock import now_ns
-from imudrv.ports.base import LineErrors, Port, PortLostError, require_transport
+from imudrv.ports.base import OTHER_END_GONE, LineErrors, Port, PortLostError, require_transport
 from imudrv.ports.holders import holders
+from imudrv.ports.permission import permission_advice
+from imudrv.posix import fcntl, termios
 from imudrv.profiles.schema import Profile, SerialLine
 from imudrv.records import Arrival, Source
 from imudrv.url import Url, device_path, host_and_port, serial_settings
@@ -35,6 +35,7 @@ _SLICE_S: Final = 0.02
 _CONNECT_S: Final = 1.0
 _SHOWN_PORTS: Final = 10
 _TIOCGICOUNT: Final = 0x545D  # Linux, asm-generic/ioctls.h
+_OPEN_ERRORS: Final = (OSError,) if termios is None else (OSError, termios.error)
 _COUNTS: Final = struct.Struct("20i")  # struct serial_icounter_struct, linux/serial.h
 
 
@@ -91,7 +92,7 @@ def explain(device: str, error: OSError) -> str:
         case errno.ENOENT | errno.ENODEV | errno.ENXIO:
             return f"there is no {device}; {_ports_there_are()}"
         case errno.EACCES | errno.EPERM:
-            return f"no permission for {device}; {_who_may(device)}"
+            return f"no permission for {device}; {permission_advice(Path(device))}"
         case errno.EBUSY | errno.EAGAIN:
             users, _ = holders(Path(device).resolve())
             who = ", ".join(users) or f"another program (`sudo fuser -v {device}` names it)"
@@ -114,6 +115,12 @@ def take_exclusively(descriptor: int) -> None:
         fcntl.ioctl(descriptor, termios.TIOCEXCL)
 
 
+def receiver_of(device: serial.Serial | socket.socket) -> Callable[[int], bytes]:
+    """Return what reads at most a number of bytes that a device has now."""
+    # Only on POSIX systems is a socket a file.
+    return device.recv if isinstance(device, socket.socket) else partial(os.read, device.fileno())
+
+
 class DescriptorPort(Port):
     """Device with a file descriptor; one read of it is one arrival.
 
@@ -131,6 +138,7 @@ class DescriptorPort(Port):
         super().__init__(url, Source.HARDWARE)
         self._device = device
         self._fd = device.fileno()
+        self._receive = receiver_of(device)
         self._closed = False
 
     def read(self, timeout_s: float) -> Arrival:
@@ -139,19 +147,24 @@ class DescriptorPort(Port):
             raise PortLostError(f"{self.url}: the port is closed")
         try:
             ready = select.select([self._fd], (), (), timeout_s)[0]
-            data = os.read(self._fd, _AT_ONCE) if ready else b""
+            data = self._receive(_AT_ONCE) if ready else b""
         except BlockingIOError:
             return Arrival(now_ns(), b"")
         except OSError as error:
-            raise PortLostError(f"{self.url}: the port is gone: {error.strerror or error}") from error
+            raise self.fault(error.errno or errno.EIO) from error
         t_ns = now_ns()
         if ready and not data:
-            raise PortLostError(f"{self.url}: the other end has gone")
+            raise self.fault(OTHER_END_GONE)
         return Arrival(t_ns, data)
+
+    @property
+    def descriptor(self) -> int | None:
+        """See `Port.descriptor`."""
+        return None if self._closed else self._fd
 
     def line_errors(self) -> LineErrors:
         """See `Port.line_errors`."""
-        if self._closed:
+        if self._closed or fcntl is None:
             return LineErrors()
         try:
             counts = fcntl.ioctl(self._fd, _TIOCGICOUNT, bytes(_COUNTS.size))
@@ -212,12 +225,12 @@ def _open(url: str, target: str, settings: dict[str, Any]) -> Port:
         if isinstance(cause, OSError) and cause.errno != errno.EINVAL:  # unplugged while its speed was set
             raise PortLostError(f"{url}: {explain(target, cause)}") from error
         raise InputError(f"{url}: {error}") from error
-    except (OSError, termios.error) as error:
+    except _OPEN_ERRORS as error:
         if "expected a string in the form" in str(error):
             raise InputError(f"{url}: {error}") from error
         reason = error if isinstance(error, OSError) else OSError(*error.args)
         raise PortLostError(f"{url}: {explain(target, reason)}") from error
-    if not isinstance(device, serial.Serial) or target.startswith("spy:"):
+    if termios is None or not isinstance(device, serial.Serial) or target.startswith("spy:"):
         return PyserialPort(url, device)
     if not Path(target).resolve().is_relative_to("/dev/pts"):  # the other end of a pty keeps the flag alive
         take_exclusively(device.fileno())
@@ -240,7 +253,7 @@ def _connect(url: str, address: tuple[str, int]) -> Port:
 
 def _device(url: Url) -> str:
     device = Path(device_path(url))
-    if device.exists() and not device.is_char_device():
+    if termios is not None and os.path.exists(device) and not device.is_char_device():
         kind = "folder" if device.is_dir() else "file"
         raise InputError(
             f"{url.text}: expected a serial device, got a {kind}; a capture is read with "
@@ -256,11 +269,3 @@ def _ports_there_are() -> str:
         return "there is no serial port: is it plugged in?"
     more = ", ..." if len(names) > _SHOWN_PORTS else ""
     return f"there are {', '.join(names[:_SHOWN_PORTS])}{more}"
-
-
-def _who_may(device: str) -> str:
-    try:
-        group = Path(device).group()
-    except (OSError, KeyError):
-        return "run as a user with permission"
-    return f"its group is {group}: `sudo usermod -aG {group} $USER`, then log in again, or add a udev rule"

@@ -5,6 +5,7 @@ messages     its messages: numbers and checks
 translation  to the decoder's `Layout`
 advice       what to write instead of what a profile cannot say
 summary      what a profile says, in a few lines
+line_load    how much of the line its samples take
 dbc          skeleton of a profile from a DBC file
 version_1    profiles of version 1 in the words of version 2
 """

@@ -9,7 +9,6 @@ from pydantic import Field as Key
 from imudrv.files.model import Model
 from imudrv.records import EXTENDED
 from imudrv.wire import layout
-from imudrv.wire.check import MAX_AROUND
 
 NumberType = Literal[
     "u8", "u16", "u24", "u32", "u40", "u48", "u56", "u64",
@@ -201,9 +200,9 @@ class Check(Model):
             raise ValueError("expected a check outside of the bytes it covers, got one inside")
         for name, around in (("prefix", self.prefix), ("suffix", self.suffix)):
             size = len(bytes.fromhex(around or ""))
-            if size > MAX_AROUND or size % self.word:
+            if size > layout.MAX_AROUND or size % self.word:
                 raise ValueError(
-                    f"expected a {name} of at most {MAX_AROUND} bytes, whole words, got {size} bytes"
+                    f"expected a {name} of at most {layout.MAX_AROUND} bytes, whole words, got {size} bytes"
                 )
         if self.kind == "crc" and self.polynomial == 0:
             raise ValueError("expected the CRC's polynomial, got none")

@@ -14,11 +14,12 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Final
 
 import numpy as np
 
 from imudrv.errors import InputError
+from imudrv.files.inputs import open_file
 from imudrv.files.outputs import require_other
 from imudrv.files.tables import increment_columns, table, writing
 from imudrv.recording.reader import Recording
@@ -27,8 +28,6 @@ from imudrv.recording.waypoint import export_imr
 from imudrv.records import INCREMENTS, Records
 from imudrv.wire.candump import format_candump
 from imudrv.wire.datagram import DatagramDecoder
-
-T = TypeVar("T")
 
 KINDS: Final = ("csv", "npz", "raw", "candump", "imr", "ros2")
 """Names of the formats."""
@@ -61,11 +60,11 @@ def export(recording: Recording, kind: str, target: Path) -> None:
     if kind == "raw":
         _require_transport(recording, "serial", "--to candump")
         with writing(target) as file:
-            file.writelines(_wire(recording, bytes))
+            file.writelines(reads.data.tobytes() for reads in recording.reads())
     elif kind == "candump":
         _require_transport(recording, "can", "--to raw")
         with writing(target) as file:
-            file.writelines(map(format_candump, _wire(recording, np.ndarray)))
+            file.writelines(format_candump(reads.data) for reads in recording.reads())
     elif kind == "imr":
         export_imr(recording, target)
     elif kind == "ros2":
@@ -99,16 +98,13 @@ def export_datagrams(path: Path, kind: str, target: Path) -> None:
 
 def _datagrams(path: Path) -> Iterator[Records]:
     decoder = DatagramDecoder()
-    try:
-        with path.open("rb") as file:
-            while data := file.read(_CHUNK_BYTES):
-                increments, _, rejects = decoder.feed(data)
-                if rejects.size:
-                    place = rejects["offset"][0]
-                    raise InputError(f"{path}: byte {place}: expected I50N datagrams, got other bytes")
-                yield increments
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    with open_file(path) as file:
+        while data := file.read(_CHUNK_BYTES):
+            increments, _, rejects = decoder.feed(data)
+            if rejects.size:
+                place = rejects["offset"][0]
+                raise InputError(f"{path}: byte {place}: expected I50N datagrams, got other bytes")
+            yield increments
 
 
 def _write_table(suffix: str, pieces: Iterator[Records], target: Path) -> None:
@@ -124,14 +120,3 @@ def _require_transport(recording: Recording, transport: str, instead: str) -> No
         raise InputError(
             f"{recording.path}: expected a recording of a {transport} unit, got {came}: {instead}"
         )
-
-
-def _wire(recording: Recording, kind: type[T]) -> Iterator[T]:
-    """Yield what was received, all of one kind."""
-    for arrival in recording.arrivals():
-        if not isinstance(arrival.data, kind):
-            raise InputError(
-                f"{recording.path}: expected wire data of its profile's transport, got those of another; "
-                "the file is damaged"
-            )
-        yield arrival.data

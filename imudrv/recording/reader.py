@@ -20,6 +20,8 @@ from mcap.writer import MCAP0_MAGIC
 from imudrv.calibration import Calibration
 from imudrv.errors import InputError
 from imudrv.files import settings_file
+from imudrv.files.atomic import MAX_BYTES
+from imudrv.files.inputs import open_file
 from imudrv.profiles.schema import Profile
 from imudrv.recording.format import (
     CALIBRATION,
@@ -37,9 +39,14 @@ from imudrv.recording.format import (
 from imudrv.recording.reads import Gatherer, Reads, Recorded
 from imudrv.records import MESSAGE, Arrival, Records, Timebase
 from imudrv.wire.datagram import DatagramDecoder
+from imudrv.wire.layout import Layout
 
-MAX_RECORD_BYTES: Final = 64 << 20
-"""Largest record, and largest unpacked chunk, bytes."""
+MAX_RECORD_BYTES: Final = 16 << 20
+"""Largest record, and largest unpacked chunk, bytes: a chunk is held packed and unpacked at once."""
+MAX_MESSAGE_BYTES: Final = 4 << 20
+"""Largest message, bytes: a read of a port, or what was published for it; simulated ones are large."""
+MAX_DEFINITION_BYTES: Final = 1 << 20
+"""Largest total of the schemas and channels, which are kept, bytes."""
 
 _RECORD: Final = struct.Struct("<BQ")
 _MESSAGE: Final = struct.Struct("<HIQQ")
@@ -53,9 +60,14 @@ _READ: Final[dict[int, Callable[[ReadDataStream], _Record]]] = {
     Opcode.METADATA: Metadata.read,
     Opcode.CHUNK: Chunk.read,
 }
+_IN_CHUNKS: Final = frozenset({int(Opcode.SCHEMA), int(Opcode.CHANNEL), int(Opcode.MESSAGE)})
+_SMALL: Final = _IN_CHUNKS | {int(Opcode.METADATA)}
 _NONE: Final = frozenset[int]()
 _LARGE: Final = frozenset({int(Opcode.MESSAGE), int(Opcode.CHUNK)})
 _BUFFER_BYTES: Final = 1 << 18  # thousands of reads, and with all that is made of them within the cache
+
+
+_UNPACKER: Final = zstandard.ZstdDecompressor(max_window_size=MAX_RECORD_BYTES)
 
 
 class RecordAt(NamedTuple):
@@ -66,9 +78,9 @@ class RecordAt(NamedTuple):
 
 
 class Recording:
-    """A recording, chunked or not, of any length: it is read as a stream.
+    """A recording, chunked or not, of any length: it is read as a stream, with at most 64 MiB in memory.
 
-    A recording that was cut, at whatever byte, is read up to the cut.
+    A recording that was cut, at whatever byte after its profile, is read up to the cut.
 
     Parameters
     ----------
@@ -80,11 +92,14 @@ class Recording:
     path : Path
     cut : bool
         Whether the end is absent.
+    profile_text : str
+        Text of the profile file.
 
     Raises
     ------
     InputError
-        The file cannot be read, or is no MCAP file.
+        The file cannot be read, is no MCAP file, or has no profile: it was cut before that, or is not from
+        this driver.
 
     Examples
     --------
@@ -97,29 +112,19 @@ class Recording:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = path = Path(path)
-        try:
-            with path.open("rb") as file:
-                head = file.read(len(MCAP0_MAGIC))
-                self.cut = not _has_end(file)
-        except OSError as error:
-            raise InputError(f"{path}: expected a recording, cannot read it: {error.strerror}") from error
+        with open_file(path) as file:
+            head = file.read(len(MCAP0_MAGIC))
+            self.cut = not _has_end(file)
         if not MCAP0_MAGIC.startswith(head):
             raise InputError(f"{path}: expected a recording (MCAP), got another kind of file")
+        text = next((text for _, text in self._attachments(PROFILE)), None)
+        if text is None:
+            why = "it was cut before it, there is nothing in it" if self.cut else "it is not from this driver"
+            raise InputError(f"{path}: expected a recording with its {PROFILE}, got none: {why}")
+        self.profile_text = text
 
     def __repr__(self) -> str:
-        try:
-            profile = self.profile.name
-        except InputError:
-            profile = "no profile"
-        return f"<Recording {self.path}, {profile}, {'cut' if self.cut else 'complete'}>"
-
-    @property
-    def profile_text(self) -> str:
-        """Text of the profile file."""
-        for _, text in self._attachments(PROFILE):
-            return text
-        why = "it was cut before it, there is nothing in it" if self.cut else "it is not from this driver"
-        raise InputError(f"{self.path}: expected a recording with its {PROFILE}, got none: {why}")
+        return f"<Recording {self.path}, {self.profile.name}, {'cut' if self.cut else 'complete'}>"
 
     @property
     def profile(self) -> Profile:
@@ -149,8 +154,13 @@ class Recording:
                 return item.record.metadata
         return {}
 
-    def reads(self) -> Iterator[Reads]:
+    def reads(self, layout: Layout | None = None) -> Iterator[Reads]:
         """Yield the reads of the port, many at once.
+
+        Parameters
+        ----------
+        layout : Layout, optional
+            Layout of the profile that they are decoded with; default: that of the recording.
 
         Yields
         ------
@@ -160,8 +170,21 @@ class Recording:
         Raises
         ------
         InputError
-            The file is damaged or cannot be read; what is before the damage comes first.
+            The layout is for CAN messages and the recording is of a serial line, or the other way round; or
+            the file is damaged or cannot be read: what is before the damage comes first.
         """
+        layout = layout or self.profile.layout()
+        for reads in self._all_reads():
+            if (reads.data.dtype == MESSAGE) != layout.can:
+                kinds = "CAN messages", "bytes of a serial line"
+                expected, came = kinds if layout.can else kinds[::-1]
+                raise InputError(
+                    f"{self.path}: expected {expected} for {layout.name}, got a recording of {came}; "
+                    "use the profile of the unit, which is in the recording"
+                )
+            yield reads
+
+    def _all_reads(self) -> Iterator[Reads]:
         timebase, gatherer = Timebase(), Gatherer()
         channels: dict[int, Channel] = {}
         for offset, item in self._items(gatherer=gatherer):
@@ -176,9 +199,9 @@ class Recording:
                 encoding = channels[item.channel_id].message_encoding
                 yield from self._reads(offset, self._one(offset, item, encoding), timebase)
 
-    def arrivals(self) -> Iterator[Arrival]:
-        """Yield the reads of the port."""
-        for reads in self.reads():
+    def arrivals(self, layout: Layout | None = None) -> Iterator[Arrival]:
+        """Yield the reads of the port, one by one; see `reads`."""
+        for reads in self.reads(layout):
             data: bytes | Records = reads.data if reads.data.dtype == MESSAGE else reads.data.tobytes()
             begin = 0
             for end, t_ns in zip(reads.ends.tolist(), reads.times.tolist(), strict=True):
@@ -246,6 +269,8 @@ class Recording:
     def _attachments(self, name: str) -> Iterator[tuple[int, str]]:
         for offset, record in self.records(skip_messages=True):
             if isinstance(record, Attachment) and record.name == name:
+                if len(record.data) > MAX_BYTES:
+                    raise self._corrupt(offset, f"expected a {name} of at most {MAX_BYTES} bytes")
                 try:
                     yield record.log_time, record.data.decode()
                 except UnicodeDecodeError as error:
@@ -286,20 +311,16 @@ class Recording:
         self, skipped: frozenset[int] = _NONE, gatherer: Gatherer | None = None
     ) -> Iterator[tuple[int, _Record | Recorded]]:
         """Yield the records outside and inside of chunks, and the reads that a gatherer takes."""
-        channels: set[int] = set()
+        defined = _Definitions()
         try:
             with BufferedReader(self.path.open("rb", 0), _BUFFER_BYTES) as file:
                 file.seek(len(MCAP0_MAGIC))
-                for offset, item in self._items_of(file, skipped, channels, gatherer):
+                for offset, item in self._items_of(file, skipped, defined, gatherer):
                     if not isinstance(item, Chunk):
                         yield offset, item
                         continue
                     chunk = BufferedReader(BytesIO(self._unpacked(item, offset)), _BUFFER_BYTES)
-                    for inside, record in self._items_of(chunk, skipped, channels, gatherer):
-                        if isinstance(record, Chunk):
-                            raise self._corrupt(offset, "expected no chunk inside of a chunk")
-                        # Approximate: an offset inside refers to the unpacked chunk.
-                        yield offset + inside, record
+                    yield from self._items_of(chunk, skipped, defined, gatherer, chunk_at=offset)
         except OSError as error:
             raise InputError(f"{self.path}: cannot be read on: {error.strerror or error}") from error
 
@@ -307,11 +328,12 @@ class Recording:
         self,
         file: "BufferedReader[Any]",
         skipped: frozenset[int],
-        channels: set[int],
+        defined: "_Definitions",
         gatherer: Gatherer | None,
+        chunk_at: int = 0,
     ) -> Iterator[tuple[int, _Record | Recorded]]:
         while True:
-            offset = file.tell()
+            offset = chunk_at + file.tell()  # approximate inside of a chunk, which is unpacked
             if gatherer is not None:
                 size, recorded = gatherer.gather(file.peek())
                 if size:
@@ -325,8 +347,10 @@ class Recording:
             opcode, length = _RECORD.unpack(head)
             if opcode in (Opcode.DATA_END, Opcode.FOOTER):
                 return
-            if not opcode or length > MAX_RECORD_BYTES:
+            if not opcode or length > (MAX_MESSAGE_BYTES if opcode in _SMALL else MAX_RECORD_BYTES):
                 raise self._corrupt(offset, f"expected a record, got kind {opcode} of {length} bytes")
+            if chunk_at and opcode in _READ and opcode not in _IN_CHUNKS:
+                raise self._corrupt(offset, f"expected no {Opcode(opcode).name.lower()} inside of a chunk")
             if opcode in skipped or (opcode != Opcode.MESSAGE and opcode not in _READ):
                 file.seek(length, 1)
                 continue
@@ -334,9 +358,10 @@ class Recording:
             if len(body) < length:
                 return
             record = self._parsed(opcode, body, offset)
-            if isinstance(record, Channel):
-                channels.add(record.id)
-            elif isinstance(record, Message) and record.channel_id not in channels:
+            if isinstance(record, Schema | Channel):
+                if fault := defined.fault(record, length):
+                    raise self._corrupt(offset, fault)
+            elif isinstance(record, Message) and (Channel, record.channel_id) not in defined.known:
                 raise self._corrupt(offset, f"expected a known channel, got {record.channel_id}")
             yield offset, record
 
@@ -356,11 +381,14 @@ class Recording:
 
     def _unpacked(self, chunk: Chunk, offset: int) -> bytes:
         if chunk.uncompressed_size > MAX_RECORD_BYTES:
-            raise self._corrupt(offset, f"expected a chunk of at most {MAX_RECORD_BYTES} bytes")
+            raise self._corrupt(
+                offset,
+                f"expected a chunk of at most {MAX_RECORD_BYTES} bytes, got one of {chunk.uncompressed_size}",
+            )
         limit = chunk.uncompressed_size + 1
         try:
             if chunk.compression == "zstd":
-                data = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(limit)
+                data = _UNPACKER.stream_reader(chunk.data).read(limit)
             elif chunk.compression == "lz4":
                 data = lz4.frame.open(BytesIO(chunk.data)).read(limit)
             elif chunk.compression == "":
@@ -376,6 +404,25 @@ class Recording:
 
     def _corrupt(self, offset: int, what: str) -> InputError:
         return InputError(f"{self.path}: at byte {offset}: {what}; the file is damaged")
+
+
+class _Definitions:
+    """The schemas and channels of a recording; a writer may repeat them in each chunk."""
+
+    def __init__(self) -> None:
+        self.known: dict[tuple[type, int], Schema | Channel] = {}
+        self._bytes = 0
+
+    def fault(self, record: Schema | Channel, length: int) -> str:
+        """Add a record of that many bytes; return what is wrong with it, empty if nothing is."""
+        before = self.known.setdefault((type(record), record.id), record)
+        if before is record:
+            self._bytes += length
+        if self._bytes > MAX_DEFINITION_BYTES:
+            return f"expected schemas and channels of at most {MAX_DEFINITION_BYTES} bytes in all"
+        return (
+            "" if before == record else f"expected schema or channel {record.id} as before, got another one"
+        )
 
 
 def _has_end(file: IO[bytes]) -> bool:

@@ -12,6 +12,8 @@ from imudrv.recording.format import ORIGIN
 from imudrv.recording.reader import Recording
 from imudrv.units import NS, NS_PER_S
 
+_END_NS: Final = (1 << 31) * NS_PER_S
+"""First time that a builtin_interfaces/Time cannot store: its seconds have 32 bits."""
 TOPIC: Final = "/imu/data_raw"
 
 _IMU_DEFINITION: Final = """\
@@ -57,8 +59,8 @@ def export_ros2(recording: Recording, target: Path) -> None:
     Raises
     ------
     InputError
-        The package mcap-ros2-support is absent, a sample has no interval or a time before 1970, or the file
-        cannot be written.
+        The package mcap-ros2-support is absent, a sample has no interval or a time that ROS 2 cannot store,
+        or the file cannot be written.
     """
     try:
         from mcap_ros2.writer import Writer
@@ -71,15 +73,17 @@ def export_ros2(recording: Recording, target: Path) -> None:
         schema = writer.register_msgdef("sensor_msgs/msg/Imu", _IMU_DEFINITION)
         writer.add_metadata(ORIGIN, recording.origin)
         for increments in recording.increments():
-            if (increments["interval_ns"] <= 0).any() or (increments["t_ns"] < 0).any():
+            t_ns = increments["t_ns"]
+            if (increments["interval_ns"] <= 0).any() or (t_ns < 0).any() or (t_ns >= _END_NS).any():
                 raise InputError(
-                    f"{recording.path}: expected samples with an interval and a time from 1970 on, got others"
+                    f"{recording.path}: expected samples with an interval and a time from 1970 to 2038, got "
+                    "others; choose another format"
                 )
             interval_s = increments["interval_ns"][:, np.newaxis] * NS
             rates = (increments["dtheta_b"] / interval_s).tolist()
             forces = (increments["dv_b"] / interval_s).tolist()
-            for t_ns, rate, force in zip(increments["t_ns"].tolist(), rates, forces, strict=True):
-                writer.write_message(TOPIC, schema, _imu_message(t_ns, rate, force), t_ns, t_ns)
+            for stamp_ns, rate, force in zip(t_ns.tolist(), rates, forces, strict=True):
+                writer.write_message(TOPIC, schema, _imu_message(stamp_ns, rate, force), stamp_ns, stamp_ns)
         writer.finish()  # type: ignore[no-untyped-call]
 
 

@@ -78,7 +78,10 @@ def export_imr(recording: Recording, target: Path) -> None:
     header["szProgramName"] = f"imudrv {version('imu50')}".encode()[:31]
     gyro = _Rounding("angle", "deg", _GYRO_DEG)
     accelerometer = _Rounding("velocity", "m/s", _ACCELEROMETER_M_S)
-    with atomic_write(target) as file:
+    with (
+        atomic_write(target) as file,
+        np.errstate(over="ignore", invalid="ignore"),
+    ):  # is checked as inf or NaN
         file.write(header.tobytes())
         for increments in recording.increments():
             samples = np.zeros(increments.size, _SAMPLE)

@@ -11,7 +11,8 @@ runtime            signals, systemd, memory, priority
 warm_up            compilation before the first sample
 settings           settings file
 status             status and health
-status_socket      unix socket that reports the status
+status_socket      reports the status to those who ask
+endpoint           where they ask: a Unix socket, or a port of the loopback
 monitor            live view on the terminal
 printer            background output of text
 """

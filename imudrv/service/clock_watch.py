@@ -40,6 +40,11 @@ class ClockWatch:
         first = min((read() for _ in range(_FIRST_READINGS)), key=lambda readings: readings.spread_ns)
         self._slept_origin_ns = first.now_ns - first.awake_ns
 
+    @property
+    def awake_offset_ns(self) -> int:
+        """Time of arrival less the clock that excludes suspends, with the suspends that are known."""
+        return self._slept_origin_ns + self.timebase.slept_ns
+
     def poll(self) -> str:
         """Compare the clocks; return what has happened to them since the last call, empty if nothing."""
         readings = self._read()

@@ -1,13 +1,26 @@
 """Latency of the loop, from the read that completed a sample to its datagram on the socket."""
 
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Self
 
+import numpy as np
+
+from imudrv.kernels import kernel
+from imudrv.records import Records
 from imudrv.units import NS
 
 _SUB_BITS: Final = 4  # each factor of two in 16 bins: a quantile is correct within 6 %
-
-
 _BINS: Final = 64 << _SUB_BITS
+
+LATENCY: Final = np.dtype(
+    [
+        ("deadline_ns", np.int64),
+        ("worst_ns", np.int64),
+        ("late", np.int64),  # samples above the deadline
+        ("counts", np.int64, _BINS),
+    ],
+    align=True,
+)
+"""State of `count_latency`."""
 
 
 class LatencyReport(NamedTuple):
@@ -21,43 +34,62 @@ class LatencyReport(NamedTuple):
 
 
 class Latency:
-    """Histogram of latencies; a call allocates no object that stays.
+    """Histogram of latencies.
 
     Parameters
     ----------
     deadline_ns : int
         Latency above which a sample counts as late.
+
+    Attributes
+    ----------
+    state : ndarray of LATENCY, shape (1,)
+        For `count_latency`.
     """
 
     def __init__(self, deadline_ns: int) -> None:
-        self._deadline_ns = deadline_ns
-        self._counts = [0] * _BINS
-        self._worst_ns = 0
-        self._late = 0
+        self.state = np.zeros(1, LATENCY)
+        self.state["deadline_ns"] = deadline_ns
 
-    def add(self, latency_ns: int, samples: int) -> None:
-        """Count samples of one latency."""
-        ns = max(latency_ns, 0)
-        shift = max(ns.bit_length() - _SUB_BITS - 1, 0)
-        self._counts[(shift << _SUB_BITS) + (ns >> shift)] += samples
-        self._worst_ns = max(self._worst_ns, ns)
-        if ns > self._deadline_ns:
-            self._late += samples
+    def copy(self) -> Self:
+        """Return a copy that does not change any more."""
+        other = type(self)(0)
+        other.state[:] = self.state
+        return other
 
     @property
     def report(self) -> LatencyReport:
         """Quantiles so far; zeros before the first sample."""
-        total = sum(self._counts)
+        s = self.state[0]
+        passed, worst_ns = np.cumsum(s["counts"]), int(s["worst_ns"])
 
         def quantile(share: float) -> float:
-            passed = 0
-            for i, count in enumerate(self._counts):
-                passed += count
-                if count and passed >= share * total:
-                    return min(_upper_ns(i), self._worst_ns) * NS
-            return 0.0
+            if not passed[-1]:
+                return 0.0
+            return min(_upper_ns(int(np.searchsorted(passed, share * passed[-1]))), worst_ns) * NS
 
-        return LatencyReport(quantile(0.5), quantile(0.99), quantile(0.999), self._worst_ns * NS, self._late)
+        return LatencyReport(quantile(0.5), quantile(0.99), quantile(0.999), worst_ns * NS, int(s["late"]))
+
+
+@kernel
+def count_latency(latency_ns: int, samples: int, state: Records) -> None:
+    """Count samples of one latency.
+
+    Parameters
+    ----------
+    latency_ns, samples : int
+        The latency, and the number of samples that had it.
+    state : ndarray of LATENCY
+        `Latency.state`.
+    """
+    s = state[0]
+    ns, shift = max(latency_ns, 0), 0
+    while ns >> shift >= 2 << _SUB_BITS:
+        shift += 1
+    s["counts"][(shift << _SUB_BITS) + (ns >> shift)] += samples
+    s["worst_ns"] = max(s["worst_ns"], ns)
+    if ns > s["deadline_ns"]:
+        s["late"] += samples
 
 
 def _upper_ns(i: int) -> int:

@@ -3,35 +3,41 @@
 One thread reads, stamps, decodes, compensates and publishes, driven by samples and not by a timer. What the
 system has held back arrives as one batch and is processed as one. Everything else is done between two reads,
 fifty times a second, in microseconds.
+
+A port with a descriptor is served by a kernel (`imudrv.service.serve`), which returns for all that is not a
+read, its samples and their datagrams. Other ports are read by Python. Both use the kernels of `imudrv.chain`.
 """
 
 import json
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from datetime import UTC, datetime
+from functools import cache
 from importlib.metadata import version
+from itertools import islice
 from pathlib import Path
-from signal import SIGHUP, SIGINT, SIGTERM
+from signal import SIGINT, SIGTERM
 from typing import Final
 
 import numpy as np
 
-from imudrv import profiles
+from imudrv import profiles, system
 from imudrv.calibration import coefficients
+from imudrv.chain import Chain, Output
 from imudrv.diagnosis import LineState
 from imudrv.hostclock import now_ns
-from imudrv.pipeline import Pipeline, PipelineOutput
 from imudrv.ports import PortEndedError
-from imudrv.records import INCREMENTS, PULSES, Arrival, Flag, Source
+from imudrv.records import INCREMENTS, PULSES, Arrival, Source
 from imudrv.service.calibration_watch import CalibrationWatch
 from imudrv.service.clock_watch import ClockWatch
 from imudrv.service.events import EventLog
-from imudrv.service.latency import Latency
+from imudrv.service.latency import Latency, count_latency
 from imudrv.service.port import PortSupervisor
 from imudrv.service.recordings import Recordings
 from imudrv.service.runtime import SignalFlags, SystemdNotifier, ask_realtime, frozen_gc
+from imudrv.service.serve import DescriptorLoop, Served, Why
 from imudrv.service.settings import Settings
 from imudrv.service.status import (
     IncrementStatus,
@@ -43,16 +49,15 @@ from imudrv.service.status import (
 )
 from imudrv.service.status_socket import StatusServer, default_status_path
 from imudrv.service.warm_up import warm_up
+from imudrv.signals import SIGHUP
 from imudrv.sinks import open_sink
 from imudrv.sinks.base import Batch, Sink
 from imudrv.sinks.history import History
 from imudrv.sinks.recorder import Recorder
 from imudrv.units import NS, NS_PER_S
-from imudrv.wire.datagram import encode
 
 POLL_NS: Final = NS_PER_S // 50
 """Time between two rounds of housekeeping, and the longest wait for data."""
-_INVALID: Final = np.uint32(~Flag.VALID & 0xFFFF_FFFF)
 
 
 class Service:
@@ -114,12 +119,17 @@ class Service:
             Path(settings.calibration), settings.unit, self._layout, self._events
         )
         self._port = PortSupervisor(settings.port, self._profile, in_real_time, self._events, clock)
-        self._pipeline = Pipeline(
+        self._chain = Chain(
             self._profile,
             coefficients(self._calibration.current.model),
             settings.rate_filter,
+            self._port.source,
         )
         self._latency = Latency(self._layout.interval_ns)
+        is_direct = system.IS_AVAILABLE and clock is now_ns and clock_watch is None
+        self._descriptor_loop = (
+            DescriptorLoop(self._chain, self._latency, in_real_time) if is_direct else None
+        )
         self._signals = signals or SignalFlags()
         self._manager = SystemdNotifier()
         self._notices: list[str] = []
@@ -131,6 +141,8 @@ class Service:
         self._last_pulses = np.zeros(1, PULSES)
         self._last_increments = np.zeros(1, INCREMENTS)
         with ExitStack() as undo:
+            if self._descriptor_loop is not None:
+                undo.callback(self._descriptor_loop.close)
             self._sinks = list(sinks)
             for sink in sinks:
                 undo.callback(sink.close)
@@ -138,23 +150,27 @@ class Service:
                 sink = open_sink(url, self._layout)
                 undo.callback(sink.close)
                 self._sinks.append(sink)
-            self._status_server = StatusServer(
-                Path(settings.status) if settings.status else default_status_path()
-            )
-            undo.callback(self._status_server.close)
+            status_path = Path(settings.status) if settings.status else default_status_path()
+            status_server = StatusServer(status_path, self._status_line)
+            undo.callback(status_server.close)
             if settings.record:
                 self._recordings.begin(Path(settings.record))
             self._open = undo.pop_all()
-        self._status = self._assemble_status(self._started_ns)
-        self._status_line = b""
+        self._latest = self._snapshot(self._started_ns)
+        status_server.start()
 
     def run(self) -> None:
         """Serve until SIGTERM, Ctrl-C, or the end of a replay."""
         if self._settings.realtime and (refusal := ask_realtime()):
             self._notices.append(refusal)
             self._events.failure(refusal)
-        warm_up(self._profile, self._calibration.current.model, self._settings.rate_filter)
-        with self._signals.caught(SIGTERM, SIGINT, SIGHUP), frozen_gc():
+        is_direct = self._descriptor_loop is not None and self._port.source is Source.HARDWARE
+        warm_up(self._profile, self._calibration.current.model, self._settings.rate_filter, is_direct)
+        with (
+            self._signals.caught(SIGTERM, SIGINT, SIGHUP),
+            self._descriptor_loop.pipe.woken_by_signals() if self._descriptor_loop else nullcontext(),
+            frozen_gc(),
+        ):
             try:
                 self._publish_status(self._clock())
                 self._manager.notify("READY=1")
@@ -175,10 +191,12 @@ class Service:
             False once a replay or a simulation is complete.
         """
         self._recordings.switch()
-        try:
-            arrival = self._port.read(POLL_NS * NS)
-        except PortEndedError:
-            return False
+        arrival = None
+        if not self._serve():
+            try:
+                arrival = self._port.read(POLL_NS * NS)
+            except PortEndedError:
+                return False
         if step := self._clock_watch.poll():
             self._events.offset_ns = self._clock_watch.timebase.offset_ns
             self._events.event(step)
@@ -194,9 +212,9 @@ class Service:
 
     def close(self) -> None:
         """Publish the samples that are held back, and close everything; `run` does it."""
-        self._publish(self._pipeline.close(), self._clock())
+        self._publish(self._chain.close(), self._clock())
         self._port.close()
-        self._events.event(f"end: {self._pipeline.tracker.counts}")
+        self._events.event(f"end: {self._chain.tracker.counts}")
         self._publish_status(self._clock())
         self._recordings.close()
         self._open.close()
@@ -204,6 +222,7 @@ class Service:
     def stop(self) -> None:
         """End `run`, as SIGTERM does; for any thread."""
         self._signals.stop = True
+        self._wake()
 
     @property
     def port_state(self) -> LineState:
@@ -213,7 +232,7 @@ class Service:
     @property
     def status(self) -> Status:
         """Status as last published; for any thread."""
-        return self._status
+        return self._latest()
 
     def record(self, path: Path | None, since: int | None = None) -> Future[None]:
         """Record into another file, or stop recording; for any thread.
@@ -233,52 +252,95 @@ class Service:
             Done when the recording before is closed; has the `InputError` if the new one cannot be created.
             Cancelled if the service ends first, which closes the recording before as well.
         """
-        return self._recordings.request(path, since)
+        done = self._recordings.request(path, since)
+        self._wake()
+        return done
+
+    def _wake(self) -> None:
+        if self._descriptor_loop is not None:
+            self._descriptor_loop.pipe.wake()
+
+    def _serve(self) -> bool:
+        """Let the kernel serve the port, if it can; return whether Python need not read it now."""
+        descriptor = self._port.descriptor
+        if self._descriptor_loop is None or descriptor is None or self._chain.is_exchanging:
+            return False
+        clocks = self._clock_watch
+        self._chain.clock.follow(clocks.timebase)
+        outlets = [sink.outlets() for sink in self._sinks]
+        served = self._descriptor_loop.run(
+            descriptor,
+            self._next_poll_ns,
+            clocks,
+            [outlet for some in outlets for outlet in some],
+            not all(sink.is_patient for sink in self._sinks),
+        )
+        if len(served.reads):
+            self._take(served, [len(some) for some in outlets])
+        if served.error:
+            self._port.failed(served.error)
+        return served.why is not Why.CLOCKS
+
+    def _take(self, served: Served, outlets: Sequence[int]) -> None:
+        """Publish and record what the kernel has read; `outlets`: their number, for each sink."""
+        batch = Batch(*served.output)
+        if len(batch.pulses) or len(batch.increments):
+            written = iter(served.written)
+            for sink, count in zip(self._sinks, outlets, strict=True):
+                sink.written(batch, list(islice(written, count)))
+            self._count(batch)
+        if self._recordings.are_on:
+            for arrival, part in served.arrivals(self._clock_watch.timebase):
+                self._recordings.arrived(arrival)
+                self._recordings.publish(part)
+        self._port.decoded(served.data, len(batch.pulses))
 
     def _process(self, arrival: Arrival) -> None:
         read_ns = arrival.t_ns
         if not self._in_real_time:
             arrival = arrival._replace(t_ns=0)  # when it came tells nothing about its samples
         self._recordings.arrived(arrival)
-        self._pipeline.clock.follow(arrival.timebase)
-        output = self._pipeline.feed(arrival.data, arrival.t_ns)
+        self._chain.clock.follow(arrival.timebase)
+        output = self._chain.feed(arrival.data, arrival.t_ns)
         self._publish(output, read_ns)
-        self._port.decoded(arrival, len(output.pulses))
+        self._port.decoded(arrival.data, len(output.pulses))
 
-    def _publish(self, output: PipelineOutput, arrival_ns: int) -> None:
-        pulses, increments = output
-        if not len(pulses) and not len(increments):
+    def _publish(self, output: Output, arrival_ns: int) -> None:
+        batch = Batch(*output)
+        if not len(batch.pulses) and not len(batch.increments):
             return
-        if self._port.state.name == "wrong rate":
-            increments["flags"] &= _INVALID  # they do not cover the interval that they name
-        batch = Batch(pulses, increments, encode(increments, self._port.source))
         for sink in self._sinks:
             sink.publish(batch)
-        if len(pulses):
-            self._samples += len(pulses)
-            self._last_pulses = pulses
-        if len(increments):
-            self._last_increments = increments
-            if self._port.source is not Source.REPLAY:
-                self._latency.add(self._clock() - arrival_ns, len(increments))
+        if len(batch.increments) and self._port.source is not Source.REPLAY:
+            count_latency(self._clock() - arrival_ns, len(batch.increments), self._latency.state)
+        self._count(batch)
         self._recordings.publish(batch)
+
+    def _count(self, batch: Batch) -> None:
+        if len(batch.pulses):
+            self._samples += len(batch.pulses)
+            self._last_pulses = batch.pulses
+        if len(batch.increments):
+            self._last_increments = batch.increments
 
     def _poll(self, now: int) -> None:
         for sink in self._sinks:
             sink.poll()
-        self._recordings.poll()
+        if displaced := self._recordings.poll():
+            self._events.failure(displaced)
         self._port.check_line(now)
+        # At a wrong rate they do not cover the interval that they name.
+        self._chain.allow_valid(self._port.state.name != "wrong rate")
         self._manager.feed_watchdog(now)
         if self._events.is_new or now - self._rated_ns >= NS_PER_S:
             self._check_calibration(now)
             self._publish_status(now)
-        self._status_server.poll(self._status_line)
 
     def _check_calibration(self, now: int) -> None:
         if reload := self._signals.reload:
             self._signals.reload = False  # before the file is read: a later signal has it read again
         if (new := self._calibration.poll(reload)) is not None:
-            self._pipeline.replace_calibration(coefficients(new.model))
+            self._chain.replace_calibration(coefficients(new.model))
             self._recordings.calibration(now, new.content)
             self._events.event(f"calibration replaced: {new.sha256[:12]}")
 
@@ -287,51 +349,63 @@ class Service:
         self._events.is_new = False
         if now - self._rated_ns >= NS_PER_S:
             self._measure_rate(now)
-        self._status = self._assemble_status(now)
-        document = self._status.to_json()
-        self._status_line = json.dumps(document).encode() + b"\n"
-        self._recordings.status(document)
+        self._latest = latest = self._snapshot(now)
+        self._recordings.status(lambda: latest().to_json())
+
+    def _status_line(self) -> bytes:
+        return json.dumps(self._latest().to_json()).encode() + b"\n"
 
     def _measure_rate(self, now: int) -> None:
-        counts = self._pipeline.tracker.counts
+        counts = self._chain.tracker.counts
         self._rate_hz = (self._samples - self._rated_samples) / ((now - self._rated_ns) * NS)
         self._lost_last_s = counts.lost - self._rated_lost
         self._rated_samples, self._rated_lost, self._rated_ns = self._samples, counts.lost, now
         self._port.check_rate(counts.expected, self._lost_last_s, now)
 
-    def _assemble_status(self, now: int) -> Status:
-        calibration, pipeline = self._calibration, self._pipeline
-        pulses = self._last_pulses[-1]
-        return Status(
-            software=self._version,
-            pid=os.getpid(),
-            t_ns=now + self._clock_watch.timebase.offset_ns,
-            uptime_s=(now - self._started_ns) * NS,
-            port=self._port.status,
-            profile=self._profile.name,
-            unit=calibration.current.model.serial_number,
-            calibration=calibration.status,
-            rate_hz=self._rate_hz,
-            nominal_rate_hz=self._profile.rate_hz,
-            samples=SampleStatus(**vars(pipeline.tracker.counts), lost_last_s=self._lost_last_s),
-            rejected={
-                reason.name.lower(): RejectedStatus(entry.runs, entry.length)
-                for reason, entry in sorted(pipeline.decoder.rejected.items())
-            },
-            clock=pipeline.clock.report,
-            latency=self._latency.report,
-            temperature_degc=temperatures(pulses, self._layout),
-            unit_status=UnitStatus.of(int(pulses["status"]), self._layout),
-            sinks=[sink.state for sink in self._sinks],
-            recording=self._recordings.state,
-            last=IncrementStatus.of(self._last_increments[-1]),
-            notices=[
-                *self._notices,
-                *([calibration.refused] if calibration.refused else []),
-                *self._more_notices(),
-            ],
-            events=self._events.lines,
-        )
+    def _snapshot(self, now: int) -> Callable[[], Status]:
+        """Note the present state; return what makes the status of it, in any thread."""
+        calibration, chain = self._calibration, self._chain
+        pulses, increments = self._last_pulses[-1], self._last_increments[-1]
+        status_word, latency, counts = int(pulses["status"]), self._latency.copy(), chain.tracker.counts
+        started_ns, rate_hz, lost_last_s = self._started_ns, self._rate_hz, self._lost_last_s
+        t_ns, unit = now + self._clock_watch.timebase.offset_ns, calibration.current.model.serial_number
+        port, calibration_status = self._port.status, calibration.status
+        refused = [calibration.refused] if calibration.refused else []
+        rejected = [(reason, entry.runs, entry.length) for reason, entry in chain.decoder.rejected.items()]
+        clock, recording, events = chain.clock.report, self._recordings.state, self._events.lines
+        sinks = [sink.state for sink in self._sinks]
+        notices = [*self._notices, *refused, *self._more_notices()]
+
+        @cache
+        def status() -> Status:
+            return Status(
+                software=self._version,
+                pid=os.getpid(),
+                t_ns=t_ns,
+                uptime_s=(now - started_ns) * NS,
+                port=port,
+                profile=self._profile.name,
+                unit=unit,
+                calibration=calibration_status,
+                rate_hz=rate_hz,
+                nominal_rate_hz=self._profile.rate_hz,
+                samples=SampleStatus(**vars(counts), lost_last_s=lost_last_s),
+                rejected={
+                    reason.name.lower(): RejectedStatus(runs, length)
+                    for reason, runs, length in sorted(rejected)
+                },
+                clock=clock,
+                latency=latency.report,
+                temperature_degc=temperatures(pulses, self._layout),
+                unit_status=UnitStatus.of(status_word, self._layout),
+                sinks=sinks,
+                recording=recording,
+                last=IncrementStatus.of(increments),
+                notices=notices,
+                events=events,
+            )
+
+        return status
 
     def _create_recorder(self, path: Path) -> Recorder:
         if path.is_dir():
@@ -344,4 +418,5 @@ class Service:
             source=self._port.source,
             port=self._settings.port,
             unit=self._calibration.current.model.serial_number,
+            sync_s=self._settings.sync_s,
         )

@@ -9,7 +9,7 @@ from imudrv.ports import Port, PortEndedError, PortLostError, check_url, open_po
 from imudrv.ports.base import LineErrors
 from imudrv.ports.holders import holders
 from imudrv.profiles.schema import Profile
-from imudrv.records import Arrival, Source
+from imudrv.records import Arrival, Records, Source
 from imudrv.service.background import Background
 from imudrv.service.events import EventLog
 from imudrv.service.mismatch_search import MismatchSearch
@@ -101,18 +101,31 @@ class PortSupervisor:
         try:
             arrival = port.read(timeout_s)
         except PortLostError as lost:
-            self.close()
-            self.state = LineState("lost", str(lost))
-            self._events.failure(str(self.state))
+            self._lose(lost)
             return None
         except PortEndedError:
             self.state = LineState("ended")
             raise
         return arrival if len(arrival.data) else None
 
-    def decoded(self, arrival: Arrival, samples: int) -> None:
-        """Take note of the number of samples that an arrival completed."""
-        self._watch.arrived(arrival.data, samples, self._clock())
+    def failed(self, error: int) -> None:
+        """Take note of an error that a reader of the descriptor has received, see `Port.fault`."""
+        if self._port is not None:
+            self._lose(self._port.fault(error))
+
+    def _lose(self, lost: PortLostError) -> None:
+        self.close()
+        self.state = LineState("lost", str(lost))
+        self._events.failure(str(self.state))
+
+    @property
+    def descriptor(self) -> int | None:
+        """Descriptor of the open port, see `Port.descriptor`."""
+        return None if self._port is None else self._port.descriptor
+
+    def decoded(self, data: bytes | Records, samples: int) -> None:
+        """Take note of data and of the number of samples that they completed."""
+        self._watch.arrived(data, samples, self._clock())
 
     def check_rate(self, expected: int, lost: int, now_ns: int) -> None:
         """Check the rate, and after losses which other programs have the port open; call it once a second.

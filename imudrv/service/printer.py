@@ -12,6 +12,8 @@ from threading import Thread
 from types import TracebackType
 from typing import Final, TextIO
 
+from imudrv.terminal import printable
+
 LIMIT: Final = 1000
 """Maximum number of lines in the queue."""
 
@@ -108,7 +110,7 @@ class Printer(AbstractContextManager["Printer"]):
             lost = self.lost
             if lost > reported:
                 line = f"(lost lines: {lost - reported})\n{line}"
-            if self._write(f"{line}\n".encode(self._encoding, "backslashreplace")):
+            if self._write(f"{printable(line)}\n".encode(self._encoding, "backslashreplace")):
                 reported = lost
         os.close(self._fd)
 

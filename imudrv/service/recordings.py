@@ -1,16 +1,21 @@
 """Recordings of a running service: one at most at a time, begun and ended between two reads."""
 
+import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
+from itertools import count
 from pathlib import Path
 from threading import Thread
+from typing import Final
 
 from imudrv.errors import InputError
 from imudrv.records import Arrival
 from imudrv.sinks.base import Batch, SinkState
 from imudrv.sinks.history import History
 from imudrv.sinks.recorder import Recorder
+
+_RETRY_S: Final = 1.0
 
 
 class Recordings:
@@ -27,12 +32,15 @@ class Recordings:
     def __init__(self, create: Callable[[Path], Recorder], history: History | None) -> None:
         self._create, self._history = create, history
         self._recorder: Recorder | None = None
+        self._path = Path()  # as asked for
+        self._displaced = ""  # what has happened to an earlier file of this recording
+        self._retry_at = 0.0
         self._requests: deque[tuple[Path | None, int | None, Future[None]]] = deque()
         self._is_closed = False
 
     def begin(self, path: Path) -> None:
         """Begin the first recording."""
-        self._recorder = self._create(path)
+        self._recorder, self._path = self._create(path), path
 
     def request(self, path: Path | None, since: int | None) -> Future[None]:
         """Request another recording, see `imudrv.service.loop.Service.record`; for any thread."""
@@ -47,8 +55,9 @@ class Recordings:
         if not self._requests:
             return
         path, since, done = self._requests.popleft()
-        before, self._recorder = self._recorder, None
+        before, self._recorder, self._displaced = self._recorder, None, ""
         if path is not None:
+            self._path = path
             try:
                 self._recorder = self._create(path)
             except InputError as error:
@@ -63,13 +72,22 @@ class Recordings:
             if not done.done():
                 done.set_result(None)
 
-        # Closing waits for the disk, which the loop must not.
-        Thread(target=close, name="close recording", daemon=True).start()
+        _in_background(close)
+
+    @property
+    def are_on(self) -> bool:
+        """Whether arrivals and batches are of use."""
+        return self._recorder is not None or self._history is not None
 
     @property
     def state(self) -> SinkState | None:
         """State of the current recording; None if there is none."""
-        return self._recorder.state if self._recorder is not None else None
+        if self._recorder is None:
+            return None
+        state = self._recorder.state
+        if self._displaced and state.healthy:
+            return state._replace(state=self._displaced, healthy=False)
+        return state
 
     def arrived(self, arrival: Arrival) -> None:
         """Record an arrival; to be called before it is decoded."""
@@ -97,15 +115,34 @@ class Recordings:
         if self._recorder is not None:
             self._recorder.event(t_ns, text)
 
-    def status(self, document: Mapping[str, object]) -> None:
-        """Record the status as JSON."""
+    def status(self, document: Callable[[], Mapping[str, object]]) -> None:
+        """Record the status, which is made in the writing thread."""
         if self._recorder is not None:
             self._recorder.status(document)
 
-    def poll(self) -> None:
-        """Let the recorder check its file."""
-        if self._recorder is not None:
-            self._recorder.poll()
+    def poll(self) -> str:
+        """Let the recorder check its file, and begin a new one if it was deleted or renamed.
+
+        Returns
+        -------
+        str
+            What has happened, for the user; usually empty.
+        """
+        before = self._recorder
+        if before is None:
+            return ""
+        before.poll()
+        if not before.displaced or time.monotonic() < self._retry_at:
+            return ""
+        self._retry_at = time.monotonic() + _RETRY_S
+        try:
+            self._recorder = self._create(_unused(self._path))
+        except InputError:
+            return ""  # the state of the old one says what is wrong
+        _in_background(before.close)
+        lost, now = before.state.url, self._recorder.state.url
+        self._displaced = f"{lost} was {before.displaced} while it was written; {now} continues it"
+        return f"recording {self._displaced}"
 
     def close(self) -> None:
         """Close the current recording and cancel the requests."""
@@ -114,3 +151,14 @@ class Recordings:
         self._is_closed = True
         while self._requests:
             self._requests.popleft()[-1].cancel()
+
+
+def _in_background(close: Callable[[], object]) -> None:
+    # Closing waits for the disk, which the loop must not.
+    Thread(target=close, name="close recording", daemon=True).start()
+
+
+def _unused(path: Path) -> Path:
+    """Return the path, or one like it that is not used; a folder is one."""
+    names = (path.with_stem(f"{path.stem}-{k}") for k in count(2))
+    return path if path.is_dir() or not path.exists() else next(name for name in names if not name.exists())

@@ -3,14 +3,14 @@
 import ctypes
 import gc
 import os
-import resource
 import signal
 import socket
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from typing import Final
 
-from imudrv.signals import handled
+from imudrv.posix import resource
+from imudrv.signals import SIGHUP, handled
 
 PRIORITY: Final = 40
 """SCHED_FIFO priority: above ordinary work, below the kernel's interrupt threads (50)."""
@@ -75,13 +75,13 @@ class SignalFlags:
         self._has_terminal = os.isatty(0)
 
     def _handle(self, number: int, _: object) -> None:
-        if number == signal.SIGHUP and os.isatty(0) == self._has_terminal:
+        if number == SIGHUP and os.isatty(0) == self._has_terminal:
             self.reload = True
         elif not self.stop:
             self.stop = True
-            self.hung_up = number == signal.SIGHUP
+            self.hung_up = number == SIGHUP
 
-    def caught(self, *numbers: signal.Signals) -> AbstractContextManager[None]:
+    def caught(self, *numbers: signal.Signals | None) -> AbstractContextManager[None]:
         """Handle these signals within the context."""
         return handled(self._handle, *numbers)
 

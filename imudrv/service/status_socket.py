@@ -1,18 +1,21 @@
-"""Unix socket that reports the status of a running service.
+"""Report the status of a running service to those who ask.
 
-A client connects, receives one line of JSON, and the service closes the connection.
+A client connects, receives one line of JSON, and the service closes the connection. A thread of its own makes
+the line, when a client asks.
 """
 
 import json
-import os
+import select
 import socket
-import stat
-import tempfile
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from threading import Thread
 from typing import Any, Final
 
 from imudrv.errors import InputError
+from imudrv.service.endpoint import Endpoint, connect, default_folder
+from imudrv.service.wake import WakePipe
 
 FORMAT: Final = "imu50-status"
 VERSION: Final = 1
@@ -24,68 +27,64 @@ MAX_STATUS: Final = 1 << 20
 """Largest status that a client accepts, bytes."""
 
 TIMEOUT_S: Final = 2.0
+_RENEWAL_S: Final = 1.0
+"""Period of looking whether the path still leads to the socket."""
 
 
 class StatusServer:
-    """Unix socket that only its user can open; never blocks.
+    """Answers with the status at a path.
 
     Parameters
     ----------
     path : Path
-        Path of the socket. One left by a service that has died is replaced.
+        See `Endpoint`.
+    line : callable
+        Returns the status as one line of JSON; called in the thread of the server.
 
     Raises
     ------
     InputError
-        Another service listens there, or the socket cannot be created.
+        See `Endpoint`.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, line: Callable[[], bytes]) -> None:
         self.path = path
-        if path.exists() and stat.S_ISSOCK(path.stat().st_mode):
-            with socket.socket(socket.AF_UNIX) as probe:
-                probe.settimeout(TIMEOUT_S)
-                if probe.connect_ex(os.fspath(path)) == 0:
-                    raise InputError(
-                        f"{path}: expected no other service, got one that answers; "
-                        "stop it, or give --status another path"
-                    )
-            path.unlink()
-        self._socket = socket.socket(socket.AF_UNIX)
-        before = os.umask(0o177)
-        try:
-            self._socket.bind(os.fspath(path))
-        except OSError as error:
-            self._socket.close()
-            raise InputError(f"{path}: cannot create the status socket: {error.strerror or error}") from error
-        finally:
-            os.umask(before)
-        self._socket.listen(8)
-        self._socket.setblocking(False)
+        self._line = line
+        self._endpoint = Endpoint(path)
+        self._pipe = WakePipe()
+        self._is_closing = False
+        self._thread = Thread(target=self._run, name="status", daemon=True)
 
-    def poll(self, line: bytes) -> None:
-        """Send the status to the clients that have connected.
-
-        Parameters
-        ----------
-        line : bytes
-            Status as one line of JSON.
-        """
-        while True:
-            try:
-                client, _ = self._socket.accept()
-            except OSError:
-                return
-            with client, suppress(OSError):
-                # Larger than any status, so that sending never waits for the client.
-                client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MAX_STATUS)
-                client.setblocking(False)
-                client.sendall(line)
+    def start(self) -> None:
+        """Answer clients from now on."""
+        self._thread.start()
 
     def close(self) -> None:
         """Stop listening and remove the socket."""
-        self._socket.close()
-        self.path.unlink(missing_ok=True)
+        self._is_closing = True
+        self._pipe.wake()
+        if self._thread.is_alive():
+            self._thread.join(TIMEOUT_S)
+        self._pipe.close()
+        self._endpoint.close()
+
+    def _run(self) -> None:
+        while not self._is_closing:
+            listener = self._endpoint.listener.fileno()
+            ready, _, _ = select.select([listener, self._pipe.descriptor], [], [], _RENEWAL_S)
+            if listener in ready:
+                with suppress(OSError):
+                    self._answer()
+            elif not ready:
+                self._endpoint.renew()
+
+    def _answer(self) -> None:
+        client, _ = self._endpoint.listener.accept()
+        with client:
+            # Larger than any status, so that sending never waits for the client.
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MAX_STATUS)
+            client.setblocking(False)
+            client.sendall(self._line())
 
 
 def ask(path: Path) -> dict[str, Any]:
@@ -108,9 +107,7 @@ def ask(path: Path) -> dict[str, Any]:
     """
     data = bytearray()
     try:
-        with socket.socket(socket.AF_UNIX) as channel:
-            channel.settimeout(TIMEOUT_S)
-            channel.connect(os.fspath(path))
+        with connect(path, TIMEOUT_S) as channel:
             while len(data) <= MAX_STATUS and (piece := channel.recv(1 << 16)):
                 data += piece
     except OSError as error:
@@ -120,7 +117,7 @@ def ask(path: Path) -> dict[str, Any]:
         ) from error
     try:
         status = json.loads(data)
-    except ValueError:
+    except (ValueError, RecursionError):
         status = None
     if not isinstance(status, dict) or (status.get("format"), status.get("version")) != (FORMAT, VERSION):
         raise InputError(f"{path}: expected {FORMAT} version {VERSION}, got {bytes(data[:40])!r}")
@@ -128,5 +125,5 @@ def ask(path: Path) -> dict[str, Any]:
 
 
 def default_status_path() -> Path:
-    """Return the default path of the status socket: in the user's runtime folder."""
-    return Path(os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()) / "imu50.sock"
+    """Return the default path of the status socket; see `imudrv.service.endpoint.default_folder`."""
+    return default_folder() / "imu50.sock"

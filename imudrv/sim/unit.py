@@ -28,7 +28,7 @@ from imudrv.imu.compensation import require_sensors
 from imudrv.imu.conversion import constants
 from imudrv.kernels import kernel
 from imudrv.nav.earth import earth_rate_n
-from imudrv.records import Records, samples_type
+from imudrv.records import Records
 from imudrv.sim.integrate import Body, Dithering, Integrals, Motion, Shaking
 from imudrv.sim.path import cycles_at, split_cycles
 from imudrv.sim.scenario import BiasStep, Dither, Faults, Motor, Residuals, Saturation, Scenario, nominal
@@ -182,8 +182,6 @@ def simulate(scenario: Scenario, layout: Layout, chunk: int = 65_536) -> Iterato
     skew, split_ns = divmod(round(scenario.unit.accelerometer_skew_s / NS), interval)
     motion = Motion(scenario, _body(scenario, truth, interval_s), split_ns * NS)
     electronics = _electronics(scenario, truth, layout)
-    gyro, accelerometer = layout.sensors
-    kind = samples_type(gyro_pulses=gyro.is_counted, accelerometer_pulses=accelerometer.is_counted)
     start = scenario.start.counter if layout.sequence.kind is SequenceKind.COUNTER else 0
     carry = np.zeros(6)
     for first in range(0, motion.samples, chunk):
@@ -193,7 +191,7 @@ def simulate(scenario: Scenario, layout: Layout, chunk: int = 65_536) -> Iterato
         own = Integrals(*(a[-begin : n - begin] for a in around))
         later = skew - begin
         velocity = around.late[later : later + n] + around.early[later + 1 : later + 1 + n]
-        pulses = np.zeros(n, kind)
+        pulses = np.zeros(n, layout.samples_type)
         ends_ns = np.arange(first, first + n + 1) * interval.numerator // interval.denominator
         t_ns = ends_ns[1:]
         powered_ns = _powered(scenario.faults, t_ns)

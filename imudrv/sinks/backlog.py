@@ -54,6 +54,10 @@ class Backlog:
                 del self._whole[:excess]
                 self.dropped += excess // SIZE
 
+    def written(self, datagrams: bytes, size: int) -> None:
+        """Append datagrams of which the first `size` bytes were written already; nothing may be queued."""
+        self._whole += datagrams[self._begin(datagrams, size) :]
+
     def flush(self, write: Callable[[bytes], int]) -> None:
         """Write queued datagrams until the consumer blocks.
 
@@ -76,12 +80,16 @@ class Backlog:
                 self._begun = piece[written:]
                 self.sent += not self._begun
             else:
-                whole = -(-written // SIZE)
-                self._begun = piece[written : whole * SIZE]
-                self.sent += whole - bool(self._begun)
-                del self._whole[: whole * SIZE]
+                del self._whole[: self._begin(piece, written)]
             if written < len(piece):
                 return
+
+    def _begin(self, datagrams: bytes, written: int) -> int:
+        """Take note of a write; return where the datagrams begin of which nothing was written."""
+        whole = -(-written // SIZE)
+        self._begun = datagrams[written : whole * SIZE]
+        self.sent += whole - bool(self._begun)
+        return whole * SIZE
 
     def abandon(self) -> None:
         """Drop everything queued, as the consumer has disconnected."""

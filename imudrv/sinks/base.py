@@ -1,7 +1,7 @@
 """What every sink keeps to: where increments go; a slow, dead or absent consumer costs the loop nothing."""
 
 from abc import ABC, abstractmethod
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 from imudrv.records import Records
 
@@ -24,6 +24,42 @@ class Batch(NamedTuple):
     pulses: Records
     increments: Records
     datagrams: bytes
+
+
+class Outlet(NamedTuple):
+    """Descriptor that takes datagrams without Python.
+
+    Parameters
+    ----------
+    fd : int
+        The descriptor; writing to it does not block.
+    piece : int
+        Most bytes of one write, whole datagrams.
+    is_socket : bool
+        Whether it is a socket.
+    """
+
+    fd: int
+    piece: int
+    is_socket: bool = True
+
+
+class Written(NamedTuple):
+    """What an outlet has taken of the datagrams of a batch.
+
+    Parameters
+    ----------
+    size : int
+        Number of bytes, from the first datagram on.
+    last : int
+        Number of bytes in the last write.
+    error : int
+        Error number of the write after it; 0 if there was none.
+    """
+
+    size: int
+    last: int
+    error: int
 
 
 class SinkState(NamedTuple):
@@ -64,7 +100,15 @@ class Sink(ABC):
     ----------
     url : str
         URL as the user gave it.
+
+    Attributes
+    ----------
+    is_patient : bool
+        Whether `publish` may be called up to 20 ms after a batch arrived; otherwise it is called at once,
+        which costs the loop time.
     """
+
+    is_patient: ClassVar[bool] = False
 
     def __init__(self, url: str) -> None:
         self.url = url
@@ -72,6 +116,22 @@ class Sink(ABC):
     @abstractmethod
     def publish(self, batch: Batch) -> None:
         """Send a batch."""
+
+    def outlets(self) -> list[Outlet]:
+        """Return descriptors for the datagrams of the next batch; there may be none."""
+        return []
+
+    def written(self, batch: Batch, outlets: list[Written]) -> None:
+        """Take note of what the outlets have taken of a batch, and send the rest.
+
+        Parameters
+        ----------
+        batch : Batch
+            The samples, up to 20 ms old.
+        outlets : list of Written
+            One for each of `outlets`.
+        """
+        self.publish(batch)
 
     def poll(self) -> None:
         """Accept clients, send what is queued, reopen devices; called at least twenty times a second."""

@@ -33,6 +33,8 @@ class FileSink(Sink):
         Another suffix, an existing file, or a folder that cannot be written to.
     """
 
+    is_patient = True
+
     def __init__(self, url: str) -> None:
         super().__init__(url)
         path = Path(url.removeprefix("file:"))

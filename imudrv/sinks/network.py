@@ -1,17 +1,22 @@
 """Datagrams over the network: UDP to one receiver, TCP to every client."""
 
+import errno
+import os
 import select
 import socket
 import time
 from typing import Any, Final, TypeAlias
 
 from imudrv.errors import InputError
+from imudrv.loopback import LOOPBACK
 from imudrv.sinks.backlog import Backlog
-from imudrv.sinks.base import Batch, Sink, SinkState
-from imudrv.url import LOOPBACK, host_and_port, split
+from imudrv.sinks.base import Batch, Outlet, Sink, SinkState, Written
+from imudrv.url import host_and_port, split
 from imudrv.wire.datagram import SIZE
 
 MAX_CLIENTS: Final = 32
+STALLED_S: Final = 5.0
+"""Time after which a client that takes nothing loses its place."""
 _UDP_PIECE: Final = 18  # 1368 bytes: with its headers within an Ethernet frame
 _TCP_PIECE: Final = 256
 _RETRY_S: Final = 0.5
@@ -38,6 +43,8 @@ class UdpSink(Sink):
         The address is not valid.
     """
 
+    is_patient = True
+
     def __init__(self, url: str) -> None:
         super().__init__(url)
         family, self._address = _resolve(url, None, socket.SOCK_DGRAM)
@@ -61,6 +68,28 @@ class UdpSink(Sink):
             self._backlog.put(batch.datagrams, self._send)
         except OSError as error:
             self._lost(error)
+
+    def outlets(self) -> list[Outlet]:
+        """See `Sink.outlets`."""
+        is_free = self._is_connected and not self._backlog.queued
+        return [Outlet(self._socket.fileno(), _UDP_PIECE * SIZE)] if is_free else []
+
+    def written(self, batch: Batch, outlets: list[Written]) -> None:
+        """See `Sink.written`."""
+        if not outlets:
+            self.publish(batch)
+            return
+        size, last, error = outlets[0]
+        self._backlog.written(batch.datagrams, size)
+        if size:
+            self._trouble = ""
+            self._last = last // SIZE
+        if error == errno.ECONNREFUSED:
+            self._refused()
+        elif error not in (0, errno.EAGAIN):
+            self._lost(OSError(error, os.strerror(error)))
+        if self._backlog.queued:
+            self.poll()
 
     def poll(self) -> None:
         """Send what is queued; try to connect again."""
@@ -96,14 +125,18 @@ class UdpSink(Sink):
         try:
             written = self._socket.send(packet)
         except ConnectionRefusedError:
-            self._refused_until = time.monotonic() + _REFUSED_S
-            self._backlog.sent -= self._last
-            self._backlog.dropped += self._last
-            self._last = 0
+            self._refused()
             written = self._socket.send(packet)
         self._trouble = ""
         self._last = written // SIZE
         return written
+
+    def _refused(self) -> None:
+        """Count the packet before as dropped: nobody has received it."""
+        self._refused_until = time.monotonic() + _REFUSED_S
+        self._backlog.sent -= self._last
+        self._backlog.dropped += self._last
+        self._last = 0
 
     def _lost(self, error: OSError) -> None:
         """Report a lost connection and drop the queue, which would arrive too late."""
@@ -119,6 +152,7 @@ class _Client:
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.connection = connection
         self.backlog = Backlog(_TCP_PIECE)
+        self._sent, self._since = 0, time.monotonic()
 
     def put(self, datagrams: bytes) -> bool:
         """Send datagrams; return whether the client is still connected."""
@@ -138,11 +172,19 @@ class _Client:
         except OSError:
             return False
 
+    def has_stalled(self) -> bool:
+        """Whether samples have waited for `STALLED_S` without any being taken; call it after `service`."""
+        now = time.monotonic()
+        if self.backlog.sent != self._sent or not self.backlog.queued:
+            self._sent, self._since = self.backlog.sent, now
+        return now - self._since >= STALLED_S
+
 
 class TcpSink(Sink):
     """TCP server; each client has its own queue, and one that stops reading loses only its own samples.
 
-    A client that shuts down its sending side counts as disconnected.
+    A client that shuts down its sending side counts as disconnected. One that takes nothing for `STALLED_S`
+    is disconnected and counted.
 
     Parameters
     ----------
@@ -156,11 +198,15 @@ class TcpSink(Sink):
         The address is not valid or cannot be used.
     """
 
+    is_patient = True
+
     def __init__(self, url: str) -> None:
         super().__init__(url)
         family, address = _resolve(url, LOOPBACK, socket.SOCK_STREAM)
         self._clients: list[_Client] = []
+        self._free: list[_Client] = []  # those that were outlets
         self._sent = self._dropped = 0  # of disconnected clients
+        self._stalled = 0  # clients
         self._listener = socket.socket(family, socket.SOCK_STREAM)
         try:
             self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -176,6 +222,21 @@ class TcpSink(Sink):
         host, port = self._listener.getsockname()[:2]
         self._where = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
+    def outlets(self) -> list[Outlet]:
+        """See `Sink.outlets`; a client with a queue is none."""
+        self._free = [client for client in self._clients if not client.backlog.queued]
+        return [Outlet(client.connection.fileno(), _TCP_PIECE * SIZE) for client in self._free]
+
+    def written(self, batch: Batch, outlets: list[Written]) -> None:
+        """See `Sink.written`."""
+        for client, (size, _, error) in zip(self._free, outlets, strict=True):
+            client.backlog.written(batch.datagrams, size)
+            if error not in (0, errno.EAGAIN):
+                self._remove(client)
+        for client in [client for client in self._clients if client not in self._free]:
+            if not client.put(batch.datagrams):
+                self._remove(client)
+
     def publish(self, batch: Batch) -> None:
         """Send a batch."""
         for client in [client for client in self._clients if not client.put(batch.datagrams)]:
@@ -183,8 +244,12 @@ class TcpSink(Sink):
 
     def poll(self) -> None:
         """Accept new clients, remove disconnected ones, send what is queued."""
-        for client in [client for client in self._clients if not client.service()]:
-            self._remove(client)
+        for client in list(self._clients):
+            if not client.service():
+                self._remove(client)
+            elif client.has_stalled():
+                self._stalled += 1
+                self._remove(client)
         for _ in range(MAX_CLIENTS):
             try:
                 connection, _ = self._listener.accept()
@@ -200,10 +265,11 @@ class TcpSink(Sink):
         """Current state."""
         count = len(self._clients)
         clients = "1 client" if count == 1 else f"{count} clients" if count else "waiting for a client"
+        stalled = f"; {self._stalled} disconnected that took nothing for {STALLED_S:g} s"
         counts = [client.backlog for client in self._clients]
         return SinkState(
             self.url,
-            f"{clients} on {self._where}",
+            f"{clients} on {self._where}{stalled if self._stalled else ''}",
             True,
             self._sent + sum(c.sent for c in counts),
             self._dropped + sum(c.dropped for c in counts),

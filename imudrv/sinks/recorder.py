@@ -33,7 +33,10 @@ from imudrv.wire.layout import Layout
 QUEUE_BYTES: Final = 32 << 20
 """Maximum size of each queue: 15 s of single reads at 20 kHz, minutes at 1 kHz."""
 _OVERHEAD: Final = 64
-_PIECE: Final = 256  # reads, and batches, written at a time
+_PIECE: Final = 256
+"""Most reads, and batches, written at a time."""
+_PIECE_BYTES: Final = 1 << 20
+"""About as many bytes at a time, so that no message is larger than readers take (4 MiB)."""
 
 # A message; packing takes 0.2 us here and 4 us in the library, during which the loop cannot run. So the
 # summary of the library has no statistics of messages.
@@ -65,6 +68,8 @@ class Recorder:
         URL of the port.
     unit : str
         Serial number of the unit; empty if not known.
+    sync_s : float, optional
+        See `imudrv.files.spool.AppendThread`.
 
     Raises
     ------
@@ -82,12 +87,13 @@ class Recorder:
         source: Source,
         port: str,
         unit: str,
+        sync_s: float | None = None,
     ) -> None:
         self._path = path
         self._can = layout.can
         self._wire: _Queue[Arrival] = _Queue(attrgetter("size"))
         self._datagrams: _Queue[bytes] = _Queue(len)
-        self._notes: deque[tuple[int, int, Mapping[str, object]]] = deque(maxlen=1000)
+        self._notes: deque[tuple[int, int, Callable[[], Mapping[str, object]]]] = deque(maxlen=1000)
         self._calibrations: deque[tuple[int, bytes]] = deque(maxlen=10)
         self._put = 0
         self._reported = 0
@@ -96,7 +102,12 @@ class Recorder:
         self._staging = _Staging()
         self._writer = Writer(self._staging, use_chunking=False, use_statistics=False)
         self._begin(profile, calibration, source, port, unit)
-        self._spool = AppendThread(path, self._staging.take(), self._next_piece, self._last_piece)
+        self._spool = AppendThread(path, self._staging.take(), self._next_piece, self._last_piece, sync_s)
+
+    @property
+    def displaced(self) -> str:
+        """What has happened to the file, such as ``deleted``; empty while its name leads to it."""
+        return self._spool.displaced
 
     def arrived(self, arrival: Arrival) -> None:
         """Record a read of the port; call it before the data are used.
@@ -127,15 +138,15 @@ class Recorder:
         self._wire.put(*(moment.arrival for moment in moments))
         self._datagrams.put(*datagrams)
 
-    def status(self, status: Mapping[str, object]) -> None:
+    def status(self, document: Callable[[], Mapping[str, object]]) -> None:
         """Record the state of the service.
 
         Parameters
         ----------
-        status : mapping
-            Values that JSON can represent; it must not change any more.
+        document : callable
+            Returns values that JSON can represent; called in the writing thread.
         """
-        self._notes.append((now_ns(), _STATUS, status))
+        self._notes.append((now_ns(), _STATUS, document))
 
     def event(self, t_ns: int, text: str) -> None:
         """Record an event.
@@ -147,7 +158,7 @@ class Recorder:
         text : str
             What happened.
         """
-        self._notes.append((t_ns, _EVENTS, {"text": text}))
+        self._notes.append((t_ns, _EVENTS, lambda: {"text": text}))
 
     def calibration(self, t_ns: int, calibration: bytes) -> None:
         """Record a new calibration.
@@ -236,8 +247,8 @@ class Recorder:
         with suppress(IndexError):
             while True:
                 t_ns, channel, document = self._notes.popleft()
-                self._message(channel, t_ns, json.dumps(document, default=str).encode())
-        more = max(len(arrivals), len(batches)) == _PIECE
+                self._message(channel, t_ns, json.dumps(document(), default=str).encode())
+        more = self._wire.left or self._datagrams.left
         return Piece(self._staging.take(), len(datagrams) // SIZE, more)
 
     def _last_piece(self) -> bytes:
@@ -268,6 +279,7 @@ class _Queue(Generic[T]):
         self._size = size
         self._items: deque[T] = deque()
         self._put = self._taken = 0
+        self.left = False  # items, perhaps, by the bounds of the last `take`
 
     def put(self, *items: T) -> None:
         """Append items (in the loop); drop the oldest above the limit."""
@@ -279,12 +291,15 @@ class _Queue(Generic[T]):
                 self.dropped += 1
 
     def take(self, count: int) -> list[T]:
-        """Remove up to `count` items (in the thread) and return them."""
+        """Remove up to `count` items, and about `_PIECE_BYTES`, (in the thread) and return them."""
         items: list[T] = []
+        size = 0
         with suppress(IndexError):
-            while len(items) < count:
+            while len(items) < count and size < _PIECE_BYTES:
                 items.append(self._items.popleft())
-        self._taken += sum(map(self._size, items)) + _OVERHEAD * len(items)
+                size += self._size(items[-1])
+        self.left = len(items) == count or size >= _PIECE_BYTES
+        self._taken += size + _OVERHEAD * len(items)
         return items
 
 

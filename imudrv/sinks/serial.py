@@ -1,7 +1,7 @@
 """Datagrams to a serial line."""
 
+import errno
 import os
-import termios
 import time
 from contextlib import suppress
 from threading import Thread
@@ -10,9 +10,10 @@ from typing import Final
 import serial
 
 from imudrv.ports.serial import explain
+from imudrv.posix import require_posix, termios
 from imudrv.profiles.schema import SerialLine
 from imudrv.sinks.backlog import Backlog
-from imudrv.sinks.base import Batch, Sink, SinkState
+from imudrv.sinks.base import Batch, Outlet, Sink, SinkState, Written
 from imudrv.url import device_path, serial_settings, split
 from imudrv.wire.datagram import SIZE
 
@@ -39,8 +40,11 @@ class SerialSink(Sink):
         The path is missing, or a setting is not valid.
     """
 
+    is_patient = True
+
     def __init__(self, url: str) -> None:
         super().__init__(url)
+        require_posix(url, "send to udp:// or tcp:// instead")
         parts = split(url)
         self._path, self._settings = device_path(parts), serial_settings(parts, SerialLine(baudrate=BAUDRATE))
         self._backlog = Backlog(_PIECE)
@@ -59,6 +63,22 @@ class SerialSink(Sink):
             self._backlog.put(batch.datagrams, self._write)
         except OSError as error:
             self._lose(error)
+
+    def outlets(self) -> list[Outlet]:
+        """See `Sink.outlets`."""
+        port = self._port
+        is_free = port is not None and not self._backlog.queued
+        return [Outlet(port.fileno(), _PIECE * SIZE, is_socket=False)] if port and is_free else []
+
+    def written(self, batch: Batch, outlets: list[Written]) -> None:
+        """See `Sink.written`."""
+        if not outlets:
+            self.publish(batch)
+            return
+        size, _, error = outlets[0]
+        self._backlog.written(batch.datagrams, size)
+        if error not in (0, errno.EAGAIN):
+            self._lose(OSError(error, os.strerror(error)))
 
     def poll(self) -> None:
         """Send what is queued; open the port again if it is lost."""

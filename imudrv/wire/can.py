@@ -4,7 +4,7 @@ The messages of a sample have the same counter, or, where not all have one, foll
 the profile within half a sample interval.
 """
 
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 
@@ -63,21 +63,23 @@ STATE: Final = np.dtype(
         ("counter", np.int64),  # of the newest sample
         ("has_sample", np.bool_),
         ("is_anchored", np.bool_),  # the upper bits of the counter are known
+        ("held", np.int64),  # frames that wait for their full counter
         ("damaged", np.int64),  # messages since the frame before
         ("torn", np.int64),  # samples given up since the frame before
         ("latest", FRAME),  # status and temperatures that hold for the next sample
         ("released", np.int64),  # counts of the running call: frames that may go out,
-        ("found", np.int64),  # these and the held ones,
+        ("found", np.int64),  # these and those that are held,
         ("rejected", np.int64),  # rejects
     ],
     align=True,
 )
 """State that a call of the kernels leaves to the next."""
 
+CanArrays: TypeAlias = tuple[Tables, Records, Records, Records, Records]
+"""Tables of the layout, constants, open samples, state, held frames."""
+
 _SOURCE: Final = 0xFF
 _WHOLE_ID: Final = 0xFFFFFFFF
-_NO_FRAMES: Final = np.zeros(0, FRAME)
-_NO_REJECTS: Final = np.zeros(0, REJECT)
 _SOUND: Final = 0
 _WRONG_LENGTH: Final = int(Reason.WRONG_LENGTH)
 _CHECK_FAILED: Final = int(Reason.CHECK_FAILED)
@@ -113,7 +115,7 @@ class CanAssembler:
         self._constants = _constants(layout, self._tables[0])
         self._parts = sum(kind.is_part for kind in layout.messages)
         self._slots = np.zeros(OPEN_SAMPLES, SLOT)
-        self._held = _NO_FRAMES
+        self._held = np.zeros(self._constants["hold"][0] + 1, FRAME)
         self._state = np.zeros(1, STATE)
         _forget(self._constants[0], self._state[0])
 
@@ -136,12 +138,25 @@ class CanAssembler:
     def pending(self) -> int:
         """Messages of samples that are incomplete or held."""
         incomplete = sum(int(parts).bit_count() for parts in self._slots["parts"])
-        return incomplete + self._held.size * self._parts
+        return incomplete + int(self._state[0]["held"]) * self._parts
 
     @property
     def counter_disagreements(self) -> int:
         """Number of full counters that were not the expected ones."""
         return int(self._state[0]["disagreements"])
+
+    @property
+    def arrays(self) -> CanArrays:
+        """Arguments of `assemble`."""
+        return self._tables, self._constants, self._slots, self._state, self._held
+
+    def most_frames(self, messages: int) -> int:
+        """Return the largest number of frames that so many messages complete, held ones included."""
+        return self._held.size + messages
+
+    def most_rejects(self, messages: int) -> int:
+        """Return the largest number of rejects that so many messages give."""
+        return messages + OPEN_SAMPLES * self._parts
 
     def feed(self, messages: Records) -> Decoded:
         """Decode messages.
@@ -158,16 +173,10 @@ class CanAssembler:
             completed it, `t_ns` that message's time; `offset` of a reject is the index of the message,
             `length` 1. Indices count all messages ever fed.
         """
-        held = self._held.size
-        frames = np.zeros(held + messages.size, FRAME)
-        frames[:held] = self._held
-        rejects = np.zeros(messages.size + OPEN_SAMPLES * self._parts, REJECT)
-        released, found, rejected = _assemble(
-            messages, self._tables, self._constants, self._slots, self._state, frames, held, rejects
-        )
-        # Copies and views of nothing would take a quarter of a live call.
-        self._held = frames[released:found].copy() if released < found else _NO_FRAMES
-        return Decoded(frames[:released], rejects[:rejected] if rejected else _NO_REJECTS)
+        frames = np.zeros(self.most_frames(messages.size), FRAME)
+        rejects = np.zeros(self.most_rejects(messages.size), REJECT)
+        found, rejected = assemble(messages, *self.arrays, rejects, frames)
+        return Decoded(frames[:found], rejects[:rejected])
 
     def close(self) -> Decoded:
         """End of the messages.
@@ -184,7 +193,8 @@ class CanAssembler:
             if slot["parts"] >> kind & 1
         ]
         self._slots["parts"] = 0
-        frames, self._held = self._held, _NO_FRAMES
+        frames = self._held[: self._state[0]["held"]].copy()
+        self._state["held"] = 0
         return Decoded(frames, np.array(torn, REJECT))
 
 
@@ -211,27 +221,40 @@ def _constants(layout: Layout, kinds: Records) -> Records:
 
 
 @kernel
-def _assemble(
+def assemble(
     messages: Records,
     tables: Tables,
     constants: Records,
     slots: Records,
     state: Records,
-    frames: Records,
-    held: int,
+    held: Records,
     rejects: Records,
-) -> tuple[int, int, int]:
-    """Take all messages in; the first `held` frames wait for their full counter.
+    frames: Records,
+) -> tuple[int, int]:
+    """Assemble the samples of messages.
+
+    Parameters
+    ----------
+    messages : ndarray of MESSAGE
+        In the order of arrival.
+    tables, constants, slots, state, held
+        `CanAssembler.arrays`.
+    rejects : ndarray of REJECT
+        Receives the rejects, see `CanAssembler.most_rejects`.
+    frames : ndarray of FRAME
+        Receives the frames, see `CanAssembler.most_frames`.
 
     Returns
     -------
-    tuple of 3 int
-        Frames that may go out; these and the held ones; rejects.
+    tuple of int
+        Number of frames that may go out, and of rejects.
     """
     # Out of the tuple once: each access inside the loop would count references.
     kinds, fields, multiplexed, fixed_bytes, checks = tables
     c, s = constants[0], state[0]
-    s["released"], s["found"], s["rejected"] = 0, held, 0
+    s["released"], s["found"], s["rejected"] = 0, s["held"], 0
+    for f in range(s["held"]):
+        frames[f] = held[f]
     data = np.zeros(_ROOM, np.uint8)
     for i in range(messages.shape[0]):
         message = messages[np.uint64(i)]
@@ -266,7 +289,10 @@ def _assemble(
                     _make_frame(frames, slots[complete], message["t_ns"], kinds, fields, multiplexed, c, s)
                     _release(c, s)
         s["index"] += 1
-    return s["released"], s["found"], s["rejected"]
+    s["held"] = s["found"] - s["released"]
+    for f in range(s["held"]):
+        held[f] = frames[s["released"] + f]
+    return s["released"], s["rejected"]
 
 
 @kernel

@@ -13,10 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imudrv.kernels import kernel
-from imudrv.wire.layout import MAX_RANGES, Check, CheckKind
-
-MAX_AROUND: Final = 32
-"""Most bytes before and behind a message that a check covers and that are not sent."""
+from imudrv.wire.layout import MAX_AROUND, MAX_RANGES, Check, CheckKind
 
 CHECK: Final = np.dtype(
     [
@@ -66,7 +63,7 @@ def check_table(check: Check) -> np.void:
     table["after"] = len(check.suffix)
     table["suffix"][: len(check.suffix)] = list(check.suffix)
     table["crc_table"] = _crc_table(check)
-    prefix = np.frombuffer(check.prefix, np.uint8)
+    prefix = np.array(list(check.prefix), np.uint8)
     table["init"], table["second"] = _absorb(prefix, 0, prefix.size, table, _register(check), 0)
     return table
 
@@ -179,18 +176,22 @@ def _absorb_bytes(data: NDArray[np.uint8], start: int, end: int, check: np.void,
     # Unsigned positions spare numba's test for a negative index at every byte: twice as fast. Loops one after
     # the other, none in a branch, spare the counting of references to the arrays.
     p, stop = np.uint64(start), np.uint64(end)
-    one, step = np.uint64(1), np.uint64(8)
+    one, two, three, four = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(4)
+    five, six, seven, step = np.uint64(5), np.uint64(6), np.uint64(7), np.uint64(8)
     while kind == CheckKind.SUM and p < stop:
         register = np.uint32(register + data[p])
         p += one
     while p + step <= stop:
-        w = data[p : p + step]
+        # What does not depend on the register comes first: it is ready before that.
         register = np.uint32(
-            table[7, w[0] ^ (register >> s0 & 0xFF)]
-            ^ table[6, w[1] ^ (register >> s1 & 0xFF)]
-            ^ table[5, w[2] ^ (register >> s2 & 0xFF)]
-            ^ table[4, w[3] ^ (register >> s3 & 0xFF)]
-            ^ (table[3, w[4]] ^ table[2, w[5]] ^ table[1, w[6]] ^ table[0, w[7]])
+            table[3, data[p + four]]
+            ^ table[2, data[p + five]]
+            ^ table[1, data[p + six]]
+            ^ table[0, data[p + seven]]
+            ^ table[4, data[p + three] ^ (register >> s3 & 0xFF)]
+            ^ table[5, data[p + two] ^ (register >> s2 & 0xFF)]
+            ^ table[6, data[p + one] ^ (register >> s1 & 0xFF)]
+            ^ table[7, data[p] ^ (register >> s0 & 0xFF)]
         )
         p += step
     while p < stop:

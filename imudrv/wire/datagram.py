@@ -60,13 +60,29 @@ def encode(increments: Records, source: Source) -> bytes:
         76 per sample, back to back.
     """
     data = np.empty((len(increments), SIZE), np.uint8)
-    _fill(increments, data, data.view(DATAGRAM), int(source), _KINDS)
+    fill_datagrams(increments, int(source), KINDS, data, data.view(DATAGRAM))
     return data.tobytes()
 
 
 @kernel
-def _fill(increments: Records, data: NDArray[np.uint8], rows: Records, source: int, kinds: Records) -> None:
-    """Write datagrams; `rows`, shape (n, 1), and `data` are the same memory."""
+def fill_datagrams(
+    increments: Records, source: int, kinds: Records, data: NDArray[np.uint8], rows: Records
+) -> None:
+    """Encode increments.
+
+    Parameters
+    ----------
+    increments : ndarray of INCREMENTS
+        In order.
+    source : int
+        `Source` of the samples.
+    kinds : ndarray
+        `KINDS`.
+    data : ndarray of uint8, shape (n, SIZE)
+        Receives the datagrams.
+    rows : ndarray of DATAGRAM, shape (n, 1)
+        A view of `data`.
+    """
     check = kinds[0]["plain_check"]
     for i in range(increments.shape[0]):
         sample, row, out = increments[i], rows[i, 0], data[i]
@@ -126,7 +142,8 @@ _LAYOUT: Final = Layout(
 )
 
 
-_KINDS: Final = layout_tables(_LAYOUT)[0]
+KINDS: Final = layout_tables(_LAYOUT)[0]
+"""The datagram as a kind of message, for `fill_datagrams`."""
 
 
 class DatagramDecoder:

@@ -39,11 +39,16 @@ class FrameDecoder:
     ----------
     layout : Layout
         Layout of the profile.
+
+    Attributes
+    ----------
+    decoder : CanAssembler or StreamDecoder
+        The decoder of the layout's transport.
     """
 
     def __init__(self, layout: Layout) -> None:
         self.rejected: dict[Reason, RejectedRuns] = {}
-        self._decoder = CanAssembler(layout) if layout.can else StreamDecoder(layout)
+        self.decoder = CanAssembler(layout) if layout.can else StreamDecoder(layout)
 
     def feed(self, data: bytes | memoryview | Records, t_ns: int = 0) -> Records:
         """Decode what arrived.
@@ -60,10 +65,10 @@ class FrameDecoder:
         ndarray of FRAME
             The frames that became complete.
         """
-        if isinstance(self._decoder, CanAssembler) and isinstance(data, np.ndarray):
-            frames, rejects = self._decoder.feed(data)
-        elif isinstance(self._decoder, StreamDecoder) and not isinstance(data, np.ndarray):
-            frames, rejects = self._decoder.feed(data, t_ns)
+        if isinstance(self.decoder, CanAssembler) and isinstance(data, np.ndarray):
+            frames, rejects = self.decoder.feed(data)
+        elif isinstance(self.decoder, StreamDecoder) and not isinstance(data, np.ndarray):
+            frames, rejects = self.decoder.feed(data, t_ns)
         else:
             raise TypeError("expected CAN messages for a CAN profile, bytes for any other")
         if rejects.size:
@@ -94,9 +99,9 @@ class FrameDecoder:
         """
         if data.dtype == MESSAGE:
             return self.feed(data)
-        if not isinstance(self._decoder, StreamDecoder):
+        if not isinstance(self.decoder, StreamDecoder):
             raise TypeError("expected CAN messages for a CAN profile, got bytes")
-        frames, rejects = self._decoder.feed_reads(data, ends, times)
+        frames, rejects = self.decoder.feed_reads(data, ends, times)
         if rejects.size:
             self.count_rejects(rejects)
         return frames
@@ -109,7 +114,7 @@ class FrameDecoder:
         ndarray of FRAME
             The frames that were held back.
         """
-        frames, rejects = self._decoder.close()
+        frames, rejects = self.decoder.close()
         self.count_rejects(rejects)
         return frames
 

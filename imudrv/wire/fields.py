@@ -17,13 +17,16 @@ Bytes = NDArray[np.uint8]
 
 SLACK: Final = 8
 """Spare bytes after the last message of a buffer: a number is read as four or eight bytes."""
+_BLOCK: Final = 64
 
 
 @kernel
 def short_number(data: Bytes, p: int, bits: int, signed: bool, big_endian: bool) -> int:
     """Read the number of `bits` (8, 16, 24, 32) at `p`, as int64."""
-    four = data[np.uint64(p) : np.uint64(p + 4)]
-    b0, b1, b2, b3 = np.int64(four[0]), np.int64(four[1]), np.int64(four[2]), np.int64(four[3])
+    # Each by its own unsigned index: a slice would cost more than the bytes.
+    q, one, two, three = np.uint64(p), np.uint64(1), np.uint64(2), np.uint64(3)
+    b0, b1 = np.int64(data[q]), np.int64(data[q + one])
+    b2, b3 = np.int64(data[q + two]), np.int64(data[q + three])
     if big_endian:
         word = (b0 << 24 | b1 << 16 | b2 << 8 | b3) >> (32 - bits)
     else:
@@ -105,6 +108,31 @@ def fill(data: Bytes, p: int, kind: np.void, fields: Records, multiplexed: Recor
         selected = number(data, p, some["selector"])
         if (selected % some["modulo"] if some["modulo"] else selected) == some["value"]:
             _fill_field(data, p, some["field"], frame)
+
+
+@kernel
+def fill_all(data: Bytes, begin: int, kind: np.void, fields: Records, frames: Records) -> None:
+    """Read the fields of many messages of one kind without multiplexed ones.
+
+    The message of a frame is at `frame["offset"] - begin`. Field by field takes half the time of message by
+    message, in blocks that the cache holds.
+    """
+    for first in range(0, len(frames), _BLOCK):
+        block = frames[first : first + _BLOCK]
+        for f in range(np.uint64(kind["first_field"]), np.uint64(kind["end_plain"])):
+            _fill_plain(data, begin, fields[f], block)
+        for f in range(np.uint64(kind["end_plain"]), np.uint64(kind["end_field"])):
+            for i in range(len(block)):
+                _fill_field(data, block[i]["offset"] - begin, fields[f], block[i])
+
+
+@kernel
+def _fill_plain(data: Bytes, begin: int, field: np.void, frames: Records) -> None:
+    offset, bits, target = field["offset"] - begin, field["bits"], field["target"]
+    signed, is_big = field["signed"], field["big_endian"]
+    for i in range(len(frames)):
+        frame = frames[np.uint64(i)]
+        _put(short_number(data, frame["offset"] + offset, bits, signed, is_big), target, frame)
 
 
 @kernel

@@ -7,6 +7,10 @@ from functools import cached_property
 from itertools import takewhile
 from typing import Final, NamedTuple
 
+import numpy as np
+
+from imudrv.records import samples_type
+
 SEQUENCE: Final = 0
 GYRO: Final = 1
 ACCELEROMETER: Final = 4
@@ -19,6 +23,8 @@ MAX_MESSAGES: Final = 16
 """Kinds of message that a profile may have."""
 MAX_RANGES: Final = 4
 """Ranges of bytes that a check may cover."""
+MAX_AROUND: Final = 32
+"""Most bytes before and behind a message that a check covers and that are not sent."""
 NARROW_BITS: Final = 12
 """A counter of fewer bits, or a time of fewer samples, wraps within seconds: what it says about a gap depends
 on the time of arrival."""
@@ -357,6 +363,13 @@ class Layout:
     def sensors(self) -> tuple[Sensor, Sensor]:
         """Gyros and accelerometers."""
         return self.gyro, self.accelerometer
+
+    @property
+    def samples_type(self) -> np.dtype[np.void]:
+        """Type of the unit's samples, see `imudrv.records.samples_type`."""
+        return samples_type(
+            gyro_pulses=self.gyro.is_counted, accelerometer_pulses=self.accelerometer.is_counted
+        )
 
     @property
     def missing_axes(self) -> tuple[list[int], list[int]]:

@@ -4,20 +4,21 @@ Most units send one kind of message, which is a frame. Where a sample comes in s
 each other in the profile's order with nothing between them: that alone tells that they belong together.
 """
 
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from imudrv.kernels import kernel
 from imudrv.records import FRAME, REJECT, Reason, Records
-from imudrv.wire.fields import SLACK, checks_hold, fill, hold, plain_check_holds
+from imudrv.wire.fields import SLACK, checks_hold, fill, fill_all, hold, plain_check_holds
 from imudrv.wire.layout import MAX_MESSAGES, Layout
 from imudrv.wire.tables import Tables, layout_tables
 
 STATE: Final = np.dtype(
     [
         ("offset", np.int64),  # of the buffer's first byte in the stream
+        ("pending", np.int64),  # bytes of an incomplete message at the beginning of the buffer
         ("reject_offset", np.int64),  # where the run of rejected bytes begins that is still open; -1: none
         ("reject_reason", np.int64),
         ("skipped", np.int64),  # rejected bytes since the last frame
@@ -35,10 +36,12 @@ STATE: Final = np.dtype(
 )
 """State that a call of the kernel leaves to the next."""
 
+StreamArrays: TypeAlias = tuple[NDArray[np.uint8], Tables, Records, Records, bool]
+"""Buffer, tables of the layout, state, room for rejects, and whether `_scan_kinds` is needed."""
+
 _NO_SYNC: Final = int(Reason.NO_SYNC)
 _CHECK_FAILED: Final = int(Reason.CHECK_FAILED)
 _TORN: Final = int(Reason.TORN)
-_REJECTS_AT_ONCE: Final = 1024
 _NO_REJECTS: Final = np.zeros(0, REJECT)
 
 
@@ -73,36 +76,64 @@ class StreamDecoder:
     def __init__(self, layout: Layout) -> None:
         self._tables = layout_tables(layout)
         self._length = sum(message.length for message in layout.messages if message.is_part)
+        self._longest = max(message.length for message in layout.messages)
         only = layout.messages[0]
         is_usual = (
             len(layout.messages) == 1 and not only.multiplexed and only.checks in ((), (only.plain_check,))
         )
-        self._walk = _scan if is_usual else _scan_kinds
-        self._buffer: NDArray[np.uint8] = np.zeros(self._length + SLACK, np.uint8)
-        self._pending = 0
+        self._has_kinds = not is_usual
         self._state = np.zeros(1, STATE)
+        self._buffer: NDArray[np.uint8] = np.zeros(0, np.uint8)
+        self._rejects = np.zeros(0, REJECT)
+        self._end: NDArray[np.int64] = np.zeros(1, np.int64)  # of the one read of `feed`
+        self._time: NDArray[np.int64] = np.zeros(1, np.int64)
+        self.reserve(0)
         self._state["reject_offset"] = -1
         self._state["latest"]["status"] = layout.status.inverted
         self._state["latest"]["temperature"] = np.nan
-        self._rejects = np.zeros(_REJECTS_AT_ONCE, REJECT)
-        self._end: NDArray[np.int64] = np.zeros(1, np.int64)  # of the one read of `feed`
-        self._time: NDArray[np.int64] = np.zeros(1, np.int64)
 
     @property
     def pending(self) -> int:
         """Number of bytes of an incomplete message, and of the messages of an incomplete sample."""
         s = self._state[0]
-        return self._pending + int(s["part_length"][: s["parts"]].sum())
+        return int(s["pending"] + s["part_length"][: s["parts"]].sum())
 
     @property
     def bytes_fed(self) -> int:
         """Number of bytes fed so far."""
-        return int(self._state[0]["offset"]) + self._pending
+        return int(self._state[0]["offset"] + self._state[0]["pending"])
 
     @property
     def others(self) -> int:
         """Number of bytes of good messages that are no part of a sample."""
         return int(self._state[0]["others"])
+
+    @property
+    def arrays(self) -> StreamArrays:
+        """Arguments of `decode`; valid until `reserve` makes the buffer larger."""
+        return self._buffer, self._tables, self._state, self._rejects, self._has_kinds
+
+    def reserve(self, size: int) -> None:
+        """Make room in the buffer for so many bytes besides the pending ones, now and later."""
+        needed = self._longest + size + SLACK
+        if needed > self._buffer.size:
+            pending = int(self._state[0]["pending"])
+            grown = np.zeros(needed, np.uint8)
+            grown[:pending] = self._buffer[:pending]
+            self._buffer = grown
+            # A byte begins one reject at most; those of the open sample come on top.
+            self._rejects = np.zeros(needed + MAX_MESSAGES, REJECT)
+
+    def put(self, data: bytes | bytearray | memoryview | NDArray[np.uint8]) -> int:
+        """Put bytes into the buffer, for `decode`; return their number. There must be room for them."""
+        piece = np.frombuffer(data, np.uint8)
+        begin = int(self._state[0]["pending"])
+        self._buffer[begin : begin + piece.size] = piece
+        return piece.size
+
+    def most_frames(self, size: int) -> int:
+        """Return the largest number of frames that so many bytes complete."""
+        return (self._longest + size) // self._length + 1
 
     def feed(self, data: bytes | bytearray | memoryview | NDArray[np.uint8], t_ns: int = 0) -> Decoded:
         """Decode bytes.
@@ -121,7 +152,7 @@ class StreamDecoder:
         """
         piece = np.frombuffer(data, np.uint8)
         self._end[0], self._time[0] = piece.size, t_ns
-        return self._feed(piece, self._end, self._time)
+        return self.feed_reads(piece, self._end, self._time)
 
     def feed_reads(
         self,
@@ -147,40 +178,11 @@ class StreamDecoder:
         """
         if len(ends) != len(times) or (ends[-1] if len(ends) else 0) != data.size:
             raise ValueError(f"expected an end and a time a read, the last end {data.size}")
-        return self._feed(data, ends, times)
-
-    def _feed(self, piece: NDArray[np.uint8], ends: NDArray[np.int64], times: NDArray[np.int64]) -> Decoded:
-        stop = self._pending + piece.size
-        if stop + SLACK > self._buffer.size:
-            grown = np.zeros(stop + SLACK, np.uint8)
-            grown[: self._pending] = self._buffer[: self._pending]
-            self._buffer = grown
-        self._buffer[self._pending : stop] = piece
-        frames = room = np.zeros(stop // self._length + 1, FRAME)
-        rejects: list[Records] = []
-        position = read = 0
-        while True:
-            position, read, found, rejected = self._walk(
-                self._buffer,
-                position,
-                self._pending,
-                ends,
-                times,
-                read,
-                self._tables,
-                self._state,
-                room,
-                self._rejects,
-            )
-            if rejected:
-                rejects.append(self._rejects[:rejected].copy())
-            if read == len(ends):
-                break
-            room = room[found:]
-        self._pending = stop - position
-        if self._pending:
-            self._buffer[: self._pending] = self._buffer[position:stop].copy()
-        return Decoded(frames[: frames.size - room.size + found], _joined(rejects))
+        self.reserve(data.size)
+        self.put(data)
+        frames = np.zeros(self.most_frames(data.size), FRAME)
+        found, rejected = decode(ends, times, *self.arrays, frames)
+        return Decoded(frames[:found], self._rejects[:rejected].copy() if rejected else _NO_REJECTS)
 
     def close(self) -> Decoded:
         """End of the stream: what is still open or pending becomes a reject.
@@ -198,15 +200,56 @@ class StreamDecoder:
             begin, reason = s["reject_offset"], s["reject_reason"]
             rejects.append(np.array([(begin, s["offset"] - begin, reason)], REJECT))
             s["reject_offset"] = -1
-        if self._pending:
-            rejects.append(np.array([(s["offset"], self._pending, Reason.UNFINISHED)], REJECT))
-            s["offset"] += self._pending
-            self._pending = 0
-        return Decoded(np.zeros(0, FRAME), _joined(rejects))
+        if s["pending"]:
+            rejects.append(np.array([(s["offset"], s["pending"], Reason.UNFINISHED)], REJECT))
+            s["offset"] += s["pending"]
+            s["pending"] = 0
+        return Decoded(np.zeros(0, FRAME), np.concatenate(rejects) if rejects else _NO_REJECTS)
 
 
-def _joined(rejects: list[Records]) -> Records:
-    return np.concatenate(rejects) if rejects else _NO_REJECTS
+@kernel
+def decode(
+    ends: NDArray[np.int64],
+    times: NDArray[np.int64],
+    buffer: NDArray[np.uint8],
+    tables: Tables,
+    state: Records,
+    rejects: Records,
+    has_kinds: bool,
+    frames: Records,
+) -> tuple[int, int]:
+    """Decode the new bytes of the buffer, which follow the pending ones; what remains moves to its beginning.
+
+    Parameters
+    ----------
+    ends : ndarray of int64, shape (n,)
+        Where each read ends in the new bytes.
+    times : ndarray of int64, shape (n,)
+        Time of arrival of each read.
+    buffer, tables, state, rejects, has_kinds
+        `StreamDecoder.arrays`.
+    frames : ndarray of FRAME
+        Receives the frames, see `StreamDecoder.most_frames`.
+
+    Returns
+    -------
+    tuple of int
+        Number of frames and of rejects.
+    """
+    s = state[0]
+    if ends.shape[0] == 0:
+        return 0, 0
+    begin = s["pending"]
+    stop = begin + ends[-1]
+    if has_kinds:
+        position, found, rejected = _scan_kinds(buffer, begin, ends, times, tables, state, frames, rejects)
+    else:
+        position, found, rejected = _scan(buffer, begin, ends, times, tables, state, frames, rejects)
+    s["offset"] += position
+    s["pending"] = stop - position
+    for k in range(stop - position):
+        buffer[k] = buffer[position + k]
+    return found, rejected
 
 
 _DIFFERS, _MATCHES, _IS_CUT = range(3)
@@ -216,34 +259,30 @@ _DIFFERS, _MATCHES, _IS_CUT = range(3)
 @kernel
 def _scan(
     data: NDArray[np.uint8],
-    p: int,
     begin: int,
     ends: NDArray[np.int64],
     times: NDArray[np.int64],
-    read: int,
     tables: Tables,
     state: Records,
     frames: Records,
     rejects: Records,
-) -> tuple[int, int, int, int]:
-    """Walk from `p`, read by read, until the reads or the room for rejects end.
+) -> tuple[int, int, int]:
+    """Walk read by read to the end of the data.
 
-    Read k ends at `begin + ends[k]`; `read` is the first one that is not walked to its end. A message may
-    have to wait for bytes behind it that show what is before it, so a later read may complete it.
+    Read k ends at `begin + ends[k]`. A message may have to wait for bytes behind it that show what is before
+    it, so a later read may complete it.
 
     Returns
     -------
-    tuple
-        Position of the first byte that is neither in a frame nor rejected; first read that is not walked to
-        its end; number of frames and of rejects. After all reads, bytes before that position leave the
-        buffer.
+    tuple of int
+        Position of the first byte that is neither in a frame nor rejected; number of frames and of rejects.
     """
     # Out of the tuple once: each access inside the loop would count references.
-    kinds, fields, multiplexed, constants, _ = tables
+    kinds, fields, _, constants, _ = tables
     kind, s = kinds[0], state[0]
     length, offset = kind["length"], s["offset"]
-    found = rejected = 0
-    while read < ends.shape[0] and rejected < rejects.shape[0]:
+    p = found = rejected = read = 0
+    while read < ends.shape[0]:
         stop = begin + ends[read]
         header = _compare(data, p, stop, constants)
         if header == _DIFFERS:
@@ -262,37 +301,34 @@ def _scan(
             p += 1
             continue
         frame = frames[found]
-        fill(data, p, kind, fields, multiplexed, frame)
-        frame["offset"], frame["t_ns"] = offset + p, times[read]
-        frame["damaged"] = (s["skipped"] + length - 1) // length
-        s["skipped"] = 0
+        frame["offset"], frame["t_ns"], frame["damaged"] = offset + p, times[read], 0
+        if s["skipped"]:
+            frame["damaged"] = (s["skipped"] + length - 1) // length
+            s["skipped"] = 0
         found += 1
         p += length
-    if read == ends.shape[0]:
-        s["offset"] += p
-    return p, read, found, rejected
+    fill_all(data, offset, kind, fields, frames[:found])
+    return p, found, rejected
 
 
 @kernel
 def _scan_kinds(
     data: NDArray[np.uint8],
-    p: int,
     begin: int,
     ends: NDArray[np.int64],
     times: NDArray[np.int64],
-    read: int,
     tables: Tables,
     state: Records,
     frames: Records,
     rejects: Records,
-) -> tuple[int, int, int, int]:
+) -> tuple[int, int, int]:
     """Do what `_scan` does, for several kinds of message, multiplexed numbers or any checks; slower."""
     kinds, fields, multiplexed, constants, checks = tables
     s = state[0]
     offset = s["offset"]
     parts, length = _parts_of(kinds)
-    found = rejected = 0
-    while read < ends.shape[0] and rejected + MAX_MESSAGES < rejects.shape[0]:
+    p = found = rejected = read = 0
+    while read < ends.shape[0]:
         stop = begin + ends[read]
         k = _kind_at(data, p, stop, kinds, constants)
         if k == _NO_KIND:
@@ -339,9 +375,7 @@ def _scan_kinds(
             hold(frame, s["latest"])
             s["parts"] = s["skipped"] = s["torn"] = 0
             found += 1
-    if read == ends.shape[0]:
-        s["offset"] += p
-    return p, read, found, rejected
+    return p, found, rejected
 
 
 @kernel

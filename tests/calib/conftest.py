@@ -99,7 +99,13 @@ READ = 500
 """Samples of a read."""
 
 
-def record(path: Path, counters: Iterable[int], profile: str = "imu50-rs422") -> Path:
+def record(
+    path: Path,
+    counters: Iterable[int],
+    profile: str = "imu50-rs422",
+    unit: str = "nominal",
+    calibration: bytes | None = None,
+) -> Path:
     """Make a recording of samples at rest; counters as the service counts them."""
     layout = profiles.load(profile).layout()
     counter = np.array(list(counters))
@@ -107,10 +113,10 @@ def record(path: Path, counters: Iterable[int], profile: str = "imu50-rs422") ->
         path,
         layout=layout,
         profile=profiles.content(profile),
-        calibration=None,
+        calibration=calibration,
         source=Source.SIMULATOR,
         port="nowhere",
-        unit="nominal",
+        unit=unit,
     )
     encoder = StreamEncoder(layout)
     for at in range(0, len(counter), READ):

@@ -322,7 +322,7 @@ def test_the_plain_method_and_a_gauge_by_name(here: Path, capsys: pytest.Capture
         (["short.raw"], "turned 150.0 deg, want 180 +- 5"),
         (["z.raw", "short.raw"], "turned 150.0 deg, want 180 +- 5"),
         (["still.raw"], "at rest, no motion at all"),
-        (["nothing.raw"], "nothing.raw: expected a capture"),
+        (["nothing.raw"], "nothing.raw: expected a file, there is none"),
         (["site.yaml"], "site.yaml: expected frames of imu50-rs422"),
     ],
 )

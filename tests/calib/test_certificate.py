@@ -96,7 +96,7 @@ def unit(serial_number: str = "50-0017") -> Calibration:
 def test_a_certificate_read_from_its_file_has_the_same_arms_covariance_and_gauge(tmp_path: Path) -> None:
     found = identification()
     path = tmp_path / "new.yaml"
-    write(path, certificate(found, found.arms))
+    write(path, certificate(found, found.arms), None)
     read = read_calibration(path, "50-0017")
     assert read.created == WHEN
     assert read.size_effect is not None
@@ -165,7 +165,7 @@ def test_another_units_certificate_is_not_written_over(tmp_path: Path) -> None:
     before = path.read_bytes()
     found = identification()
     with pytest.raises(InputError, match="got that of '50-0018'"):
-        write(path, certificate(found, found.arms))
+        write(path, certificate(found, found.arms), None)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
 
@@ -184,7 +184,7 @@ def test_the_units_own_certificate_is_kept_beside_the_new_one(tmp_path: Path) ->
     write_calibration(path, unit())
     before = path.read_bytes()
     found = identification()
-    write(path, certificate(found, found.arms))
+    write(path, certificate(found, found.arms), None)
     (kept,) = set(tmp_path.iterdir()) - {path}
     assert kept.read_bytes() == before
 

@@ -1,20 +1,22 @@
-"""Folder of a session: nothing in it can be lost, doubled or changed undetected."""
+"""Folder of a session: nothing in it is lost, doubled or changed by accident without notice."""
 
 import json
 import os
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from hashlib import sha256
 from io import StringIO
 from pathlib import Path
 from typing import Any
 
+import bench_session
 import numpy as np
 import pytest
+from bench_session import ACCEPTED, DEGC, PROCEDURE, begin, embedded
 from rich.console import Console
 
 from calib.bench import journal as journals
 from calib.bench.entries import (
-    AcceptedStep,
     Decision,
     EmbeddedFile,
     ServiceMessage,
@@ -24,83 +26,28 @@ from calib.bench.entries import (
 )
 from calib.bench.resume import check_files, require_same, require_temperature, resume
 from calib.bench.session import Session
-from calib.bench.state import INITIAL_CERTIFICATE, JOURNAL
+from calib.bench.state import INITIAL_CERTIFICATE, JOURNAL, LOCK
 from calib.bench.verify import verify
+from calib.cli import main
 from calib.messages import Message, english
 from calib.procedure.events import Entered, Finished, Phase, Redone
+from imudrv import profiles
 from imudrv.calibration import Calibration, read_calibration_file, write_calibration
 from imudrv.errors import InputError
-from imudrv.files import atomic, settings_file
+from imudrv.files import atomic
 from imudrv.files.settings_file import SettingsFile
 from imudrv.sim.scenario import NOMINAL
-from imudrv.site import Site
 
-DEGC = {"gyro": 35.0, "accelerometer_x": 36.0}
-PROCEDURE = """
-format: imu50-procedure
-version: 1
-name: two
-poses: [{id: z-up, up: +Z, east: +X, turn_deg: 180}, {id: x-up, up: +X, east: +Y, turn_deg: 180}]
-"""
-ACCEPTED = {
-    "first_counter": 1000,
-    "last_counter": 1899,
-    "angle_deg": 180.0,
-    "duration_s": 3.0,
-    "peak_deg_per_s": 110.0,
-    "axis_tilt_deg": 0.1,
-    "rest_before_s": 30.0,
-    "rest_after_s": 4.0,
-    "level_sigma_deg": 0.001,
-    "heading_sigma_deg": 0.05,
-    "heading_deg": 1.0,
-    "v_n": [0.0, 0.0, 0.0],
-}
-"""Fields of an accepted step as the first version journaled them, without its number of samples."""
 FINISHED = Finished(("z-up", "x-up"), (), (), 1900)
 Accept = Callable[..., None]
 
 
-def embedded(path: Path) -> EmbeddedFile:
-    return EmbeddedFile.of(path, path.read_bytes())
-
-
-def begin(folder: Path) -> Session:
-    """A session whose unit's files are beside it."""
-    papers = folder.parent
-    write_calibration(papers / "unit.yaml", NOMINAL)
-    settings_file.write(papers / "site.yaml", Site(latitude_deg=28.2, longitude_deg=113.0, height_m=60.0))
-    (papers / "bench.yaml").write_text(PROCEDURE)
-    return Session.create(
-        folder,
-        procedure=embedded(papers / "bench.yaml"),
-        calibration=papers / "unit.yaml",
-        site=embedded(papers / "site.yaml"),
-        profile="imu50-rs422",
-        port="/dev/ttyUSB0",
-    )
-
-
-def accepted_step(step_id: str, recording: str, degc: dict[str, float], **more: object) -> AcceptedStep:
-    fields = {"step_id": step_id, "attempt": 1, "recording": recording, "temperature_degc": degc}
-    step = from_json({"event": "accepted", **ACCEPTED, **fields, **more})
-    assert isinstance(step, AcceptedStep)
-    return step
-
-
 @pytest.fixture
 def accept(recorded: Callable[..., Path]) -> Accept:
-    """Accept an attempt with its files; the recording begins at `since`, the attempt at 1000."""
+    """Accepts an attempt with its files; see `bench_session.accept`."""
 
-    def accept(
-        session: Session, step_id: str, degc: dict[str, float] = DEGC, since: int = 900, **more: object
-    ) -> None:
-        name = f"run-{step_id}-{session.next_attempt(step_id)}"
-        recorded(session.folder / f"{name}.mcap", range(since, 2000))
-        (session.folder / f"{name}.npz").write_bytes(name.encode() * 100)
-        for suffix in ("mcap", "npz"):
-            session.record_file(f"{name}.{suffix}")
-        session.append(accepted_step(step_id, f"{name}.mcap", degc, **more))
+    def accept(session: Session, step_id: str, *rest: Any, **more: Any) -> None:
+        bench_session.accept(session, recorded, step_id, *rest, **more)
 
     return accept
 
@@ -172,7 +119,8 @@ def test_a_flipped_bit_anywhere_in_the_journal_is_found_and_its_line_named(folde
         damaged = bytearray(data)
         damaged[at] ^= 1 << at % 8
         journal.write_bytes(damaged)
-        (fault,) = verify(folder).faults
+        verified = verify(folder)
+        fault = (*verified.faults, *verified.unfinished)[0]  # without its line break the last line is cut
         assert f"{JOURNAL}: line {line_of(data, at)}" in fault, at
 
 
@@ -218,6 +166,107 @@ def test_a_file_that_is_not_in_the_journal_is_reported(folder: Path) -> None:
     assert any("notes.txt: not in the journal" in note for note in verified.notes)
 
 
+@pytest.mark.parametrize("name", [b"\x1b[2J", b"\xff", "é\n".encode()])
+def test_the_name_of_such_a_file_cannot_control_the_terminal(
+    folder: Path, name: bytes, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path(os.fsdecode(os.fsencode(folder) + b"/" + name)).touch()
+    assert main(["verify", str(folder)]) == 3
+    shown = ascii(os.fsdecode(name))
+    assert f"{folder}/{shown}: not in the journal, not checked\n" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", [LOCK, "report.html", "profile.yaml", "certificate.yaml"])
+def test_a_symbolic_link_is_no_file_of_a_session_to_write_to(folder: Path, name: str) -> None:
+    outside = folder.parent / "outside"
+    (folder / name).unlink(missing_ok=True)
+    (folder / name).symlink_to(outside)
+    message = rf"{name}: (expected a file in the|cannot be opened)"
+    with pytest.raises(InputError, match=message), closing(Session.open(folder)) as session:
+        session.path(name)
+    assert not outside.exists()
+
+
+# One unit
+
+
+@pytest.mark.parametrize(
+    ("recording", "message"),
+    [
+        ({"unit": "50-0018"}, "expected a recording of unit 'nominal', got one of '50-0018'"),
+        ({"profile": "imu50-rs422-acc"}, "expected the profile of the plan, imu50-rs422, got another one"),
+        ({"calibration": b"other"}, "expected the calibration working.yaml, got another one"),
+    ],
+)
+def test_a_recording_of_another_unit_profile_or_calibration_is_named(
+    session: Session, accept: Accept, recorded: Callable[..., Path], recording: dict[str, Any], message: str
+) -> None:
+    accept(session, "z-up")
+    path = recorded(session.folder / "run-x-up-1.mcap", range(900, 2000), **recording)
+    session.record_file(path.name)
+    session.append(bench_session.accepted_step("x-up", path.name, DEGC))
+    assert f"{path}: {message}" in verify(session.folder).faults
+
+
+def test_the_certificate_of_another_unit_is_named(folder: Path) -> None:
+    other = NOMINAL.model_copy(update={"serial_number": "50-0018"})
+    for name in ("before.yaml", "working.yaml"):
+        (folder / name).unlink()
+        write_calibration(folder / name, other)
+    with_right_hashes(folder)
+    (fault,) = verify(folder).faults
+    assert fault.startswith(
+        f"{folder / 'before.yaml'}: expected the calibration of unit 'nominal', got that of"
+    )
+
+
+@pytest.mark.parametrize("name", ["before.yaml", "working.yaml"])
+def test_a_certificate_with_other_values_than_the_session_began_with_is_named(
+    folder: Path, name: str
+) -> None:
+    gyro = NOMINAL.gyro.model_copy(update={"bias_deg_per_h": (1.0, 0.0, 0.0)})
+    other = NOMINAL.model_copy(update={"gyro": gyro, "size_effect": None})
+    (folder / name).unlink()
+    write_calibration(folder / name, other)
+    with_right_hashes(folder)
+    fault = verify(folder).faults[0]
+    assert fault.startswith(f"{folder / name}: expected ")
+
+
+def with_right_hashes(folder: Path) -> None:
+    """Give every file and line the hash that it has now."""
+    lines = [json.loads(line) for line in (folder / JOURNAL).read_text().splitlines()]
+    for line in lines:
+        if line["event"] == "file":
+            line["sha256_of_file"] = atomic.sha256(folder / line["name"])
+    (folder / JOURNAL).write_bytes(bench_session.chained(lines))
+
+
+# Unfinished
+
+
+def test_a_session_before_its_end_is_unfinished(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["verify", str(folder)]) == 3
+    text = f"unfinished: accepted steps: z-up; resume with: calib run --session {folder}\n"
+    assert capsys.readouterr().out.endswith(text)
+
+
+def test_a_journal_cut_short_at_any_line_is_unfinished(folder: Path) -> None:
+    journal = folder / JOURNAL
+    lines = journal.read_bytes().splitlines(keepends=True)
+    for n in range(1, len(lines)):
+        journal.write_bytes(b"".join(lines[:n]))
+        assert main(["verify", str(folder)]) == 3
+        journal.write_bytes(b"".join(lines[:n]) + lines[n][:-5])
+        assert main(["verify", str(folder)]) == 3
+
+
+def test_a_session_at_its_end_without_its_certificate_is_damaged(session: Session) -> None:
+    session.end(Decision(False))
+    (fault,) = verify(session.folder).faults
+    assert "certificate.yaml: expected in the journal of a session at its end" in fault
+
+
 # Entries
 
 
@@ -251,6 +300,7 @@ def test_every_entry_of_an_older_journal_is_read_and_written_back_the_same(tmp_p
             "temperature_degc": [["gyro", 35.0], ["accelerometer_x", None]],
         },
         {"event": "restarted", "reason": "moved", **at},
+        {"event": "file", "name": "run-z-up-1.mcap", "bytes": 9, "sha256_of_file": "1" * 64},
         {"event": "accepted", "step_id": "z-up", "attempt": 1, **ACCEPTED, **recorded},
         {"event": "rejected", "reasons": ["turned 150 deg"], **at},
         *({"event": event, **at} for event in ("skipped", "redone", "aborted")),
@@ -286,12 +336,15 @@ def test_every_entry_of_an_older_journal_is_read_and_written_back_the_same(tmp_p
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ({"event": "invented"}, "unknown event 'invented'; a newer version may have written it"),
-        ({"event": "file", "name": "a", "bytes": 1}, "event 'file': field sha256_of_file: Field required"),
-        ({"event": "entered", "phase": "sleep", "step_id": "a", "attempt": 1, "counter": 1}, "field phase:"),
+        ({"event": "invented"}, "event: expected one of .*, got text 'invented'; is it of a newer version"),
+        ({"event": "file", "name": "a", "bytes": 1}, "sha256_of_file: missing; add it"),
+        (
+            {"event": "entered", "phase": "reset", "step_id": "a", "attempt": 1, "counter": 1},
+            "phase: expected 'preflight', .* or 'aborted', got text 'reset'; did you mean rest",
+        ),
     ],
 )
-def test_an_entry_that_is_not_valid_is_refused_with_its_field(line: dict[str, Any], message: str) -> None:
+def test_an_entry_that_is_not_valid_is_refused_with_its_key(line: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         from_json(line)
 
@@ -307,8 +360,9 @@ def test_a_journal_cut_in_its_last_line_is_repaired_and_nothing_before_it_change
     last = data.rindex(b"\n", 0, -1) + 1
     for end in range(last + 1, len(data), 9):
         journal.write_bytes(data[:end])
-        (fault,) = verify(folder).faults
-        assert f"line {line_of(data, last)}, the last, ends after" in fault
+        verified = verify(folder)
+        assert verified.faults == ()
+        assert f"line {line_of(data, last)}, the last, ends after" in verified.unfinished[0]
         session = Session.open(folder)
         assert "as after a power cut; it is dropped" in session.dropped
         assert events(session)[-2:] == ["accepted", "dropped"]
@@ -493,6 +547,19 @@ def test_a_session_resumes_with_the_files_it_began_with(session: Session) -> Non
     )
 
 
+def test_a_profile_of_the_users_own_is_that_in_the_plan_not_the_file_at_its_path(tmp_path: Path) -> None:
+    own = tmp_path / "own.yaml"
+    own.write_bytes(profiles.content("imu50-rs422") + b"# own\n")
+    with closing(begin(tmp_path / "session", str(own))) as session:
+        text = own.read_bytes()
+        own.unlink()
+        os.mkfifo(own)  # would block whoever opens it
+        assert session.profile() == str(session.folder / "profile.yaml")
+        assert Path(session.profile()).read_bytes() == text
+        require_same(session, profile=session.profile())
+        assert not any("not checked" in note for note in verify(session.folder).notes)
+
+
 def test_another_unit_is_refused(session: Session) -> None:
     other = NOMINAL.model_copy(update={"serial_number": "50-0018"})
     write_calibration(session.folder.parent / "unit.yaml", other)
@@ -568,9 +635,9 @@ def test_a_session_is_resumed_only_after_the_operator_confirms(
     assert "resume it? [y/n]" in shown.getvalue()
 
 
-def test_a_number_that_is_not_json_is_refused_before_it_is_written(session: Session) -> None:
+def test_a_number_that_cannot_be_read_back_is_refused_before_it_is_written(session: Session) -> None:
     before = (session.folder / JOURNAL).read_bytes()
-    with pytest.raises(ValueError, match="not JSON compliant"):
+    with pytest.raises(InputError, match=r"temperature_degc.gyro: expected a finite number, got nan"):
         session.append(UnitDetected(1, False, {"gyro": float(np.nan)}))
     assert (session.folder / JOURNAL).read_bytes() == before
 

@@ -26,8 +26,8 @@ from calib.validation.trial import Trial, TrialSettings
 from calib.validation.verdict import Validation, evaluate, noise_velocity
 from imudrv import Capture, Compensator, coefficients, load_profile, write_calibration
 from imudrv.calibration import Calibration, SensingPoints, SizeEffect
+from imudrv.chain import Chain
 from imudrv.errors import InputError
-from imudrv.pipeline import Pipeline
 from imudrv.ports import open_port
 from imudrv.ports.base import PortEndedError
 from imudrv.records import Flag, Records
@@ -325,15 +325,15 @@ def written(folder: Path, motion: list[dict[str, object]]) -> tuple[Path, Path]:
 
 def through_port(url: str) -> Records:
     """Increments of a port as the service makes them."""
-    pipeline = Pipeline(PROFILE, coefficients(NOMINAL), "causal")
+    chain = Chain(PROFILE, coefficients(NOMINAL), "causal")
     port, out = open_port(url, PROFILE), []
     try:
         while True:
             arrival = port.read(0.1)
-            out.append(pipeline.feed(arrival.data, arrival.t_ns).increments)
+            out.append(chain.feed(arrival.data, arrival.t_ns).increments)
     except PortEndedError:
         port.close()
-    return np.concatenate([*out, pipeline.close().increments])
+    return np.concatenate([*out, chain.close().increments])
 
 
 @pytest.mark.parametrize("name", FOUR)

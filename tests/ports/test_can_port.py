@@ -17,7 +17,7 @@ from imudrv import Source, load_profile
 from imudrv.errors import InputError
 from imudrv.hostclock import now_ns
 from imudrv.ports import PortLostError, open_port
-from imudrv.ports.can import CanPort
+from imudrv.ports.can_port import CanPort
 from imudrv.records import EXTENDED, MESSAGE
 
 GROUP = "239.74.163.2"

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 
-from imudrv import Source
+from imudrv import Source, profiles
 from imudrv.errors import InputError
 from imudrv.ports import PortEndedError, PortLostError, open_port, replay
-from imudrv.recording.format import BYTES, CAN_MESSAGES, WIRE, pack_messages
+from imudrv.recording.format import BYTES, CAN_MESSAGES, PROFILE, WIRE, pack_messages
 from imudrv.records import MESSAGE, Arrival
 from imudrv.wire.candump import format_candump
 
@@ -113,6 +113,7 @@ def _recording(path, encoding, reads):
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
+        writer.add_attachment(0, 0, PROFILE, "", profiles.content("imu50-rs422"))
         channel = writer.register_channel(WIRE, encoding, 0)
         for t_ns, data, *_ in reads:
             writer.add_message(channel, t_ns, data, t_ns)
@@ -143,10 +144,10 @@ def test_a_recording_of_messages_is_replayed_with_the_time_of_each(
 
 def test_a_recording_of_another_kind_of_unit_is_a_mistake_of_the_user(rs422, can_profile, tmp_path):
     serial = _recording(tmp_path / "serial.mcap", BYTES, [(1, b"x")])
-    with pytest.raises(InputError, match="for profile imu50-can, got one of bytes of a serial line"):
+    with pytest.raises(InputError, match="for imu50-can, got a recording of bytes of a serial line"):
         open_port(f"replay://{serial}", can_profile)
     bus = _recording(tmp_path / "can.mcap", CAN_MESSAGES, [(1, pack_messages([_messages(1)])[0])])
-    with pytest.raises(InputError, match="for profile imu50-rs422, got one of CAN messages"):
+    with pytest.raises(InputError, match="for imu50-rs422, got a recording of CAN messages"):
         open_port(f"replay://{bus}", rs422)
 
 
@@ -205,7 +206,7 @@ def test_a_file_that_cannot_be_replayed_is_a_mistake_of_the_user(capture, rs422,
     empty.touch()
     with pytest.raises(InputError, match="expected a file to replay, got an empty one"):
         open_port(f"replay://{empty}", rs422)
-    with pytest.raises(InputError, match="expected a file to replay, cannot read it: Is a directory"):
+    with pytest.raises(InputError, match="expected a file, got a folder"):
         open_port(f"replay://{tmp_path}", rs422)
     for name, profile, kind in (
         ("unit.raw", rs422, "a capture of imu50-rs422"),

@@ -9,7 +9,6 @@ import threading
 import tty
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import pytest
 import serial
@@ -19,6 +18,7 @@ from imudrv import Source
 from imudrv.errors import InputError
 from imudrv.hostclock import now_ns
 from imudrv.ports import PortLostError, open_port
+from imudrv.ports.permission import permission_advice
 from imudrv.ports.serial import DescriptorPort, PyserialPort, explain, take_exclusively
 
 MANY = bytes(range(256)) * 12  # less than the 4 KiB that a pty holds; has every byte that a terminal may eat
@@ -215,12 +215,11 @@ def test_a_port_that_vanishes_during_opening_is_lost_and_an_unsupported_speed_an
         open_port(f"serial://{line.path}?baudrate=123457", rs422)
 
 
-def test_a_refusal_names_the_group_with_access_and_how_to_join_it(tmp_path):
+def test_a_refusal_says_how_to_get_permission(tmp_path):
     device = tmp_path / "tty"
     device.touch()
     text = explain(str(device), PermissionError(13, "Permission denied"))
-    group = Path(device).group()
-    assert f"no permission for {device}; its group is {group}: `sudo usermod -aG {group} $USER`" in text
+    assert text == f"no permission for {device}; {permission_advice(device)}"
 
 
 def test_the_stream_of_a_tcp_server_is_received_complete(server, rs422, opened, arrivals):

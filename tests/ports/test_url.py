@@ -21,7 +21,7 @@ SERIAL_MISTAKES = [
     ("socket://host:1/path", r"expected socket://HOST:PORT"),
     ("socket://host:1?baudrate=9600", r"expected no options for socket://, got baudrate"),
     ("can://virtual/x", r"expected a port for the serial profile imu50-rs422, like serial:///dev/"),
-    ("replay:///no/such/file", r"expected a file to replay, cannot read it: No such file"),
+    ("replay:///no/such/file", r"/no/such/file: expected a file, there is none"),
 ]
 CAN_MISTAKES = [
     ("serial:///dev/ttyUSB0", r"expected a port for the can profile imu50-can, like can://INTERFACE/CHANNEL"),

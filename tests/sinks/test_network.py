@@ -1,3 +1,5 @@
+import errno
+import os
 import select
 import socket
 from collections.abc import Iterator
@@ -10,6 +12,7 @@ from realtime import DEADLINE_S
 from imudrv.errors import InputError
 from imudrv.sinks import network
 from imudrv.sinks.backlog import LIMIT
+from imudrv.sinks.base import Written
 from imudrv.sinks.network import MAX_CLIENTS, TcpSink, UdpSink
 from imudrv.wire.datagram import SIZE, DatagramDecoder
 
@@ -160,8 +163,9 @@ def test_a_tcp_client_gets_every_sample_from_its_connection_on(tcp: TcpSink, bat
 
 
 def test_a_tcp_client_that_stops_reading_loses_only_its_own_oldest_samples(
-    tcp: TcpSink, batch, wait_for
+    tcp: TcpSink, batch, wait_for, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(network, "STALLED_S", 3600.0)
     with connect(tcp, wait_for, receive_buffer=1 << 16) as stuck, connect(tcp, wait_for) as good:
         got, rest = bytearray(), bytearray()
         samples = 0
@@ -201,6 +205,28 @@ def test_a_killed_tcp_client_is_detected_by_writing(tcp: TcpSink, batch, wait_fo
     wait_for(lambda: tcp.publish(batch(0, 1)) or not clients_of(tcp))
 
 
+def test_tcp_clients_that_take_nothing_lose_their_places_and_are_counted(
+    tcp: TcpSink, batch, wait_for, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(network, "STALLED_S", 0.2)
+    port = port_of(tcp)
+    stuck = [connect(tcp, wait_for, receive_buffer=1 << 12) for _ in range(MAX_CLIENTS - 1)]
+    got, samples = bytearray(), 0
+    with connect(tcp, wait_for) as good:
+        while clients_of(tcp) > 1:
+            tcp.publish(batch(samples, 500))
+            samples += 500
+            wait_for(lambda sent=samples: tcp.poll() or take(good, got) == sent * SIZE)
+        assert counters(bytes(got)) == list(range(samples))
+        assert f"; {MAX_CLIENTS - 1} disconnected that took nothing" in tcp.state.state
+        with socket.create_connection(("127.0.0.1", port), timeout=DEADLINE_S) as late:
+            wait_for(lambda: tcp.poll() or clients_of(tcp) == 2)
+            tcp.publish(batch(samples, 1))
+            assert counters(read(late, 1)) == [samples]
+    for client in stuck:
+        client.close()
+
+
 def test_tcp_clients_beyond_the_maximum_are_refused(tcp: TcpSink, wait_for) -> None:
     clients = [connect(tcp, wait_for) for _ in range(MAX_CLIENTS)]
     with socket.create_connection(("127.0.0.1", port_of(tcp)), timeout=DEADLINE_S) as late:
@@ -237,3 +263,50 @@ def test_a_host_given_is_the_one_that_is_served() -> None:
     sink.close()
     with pytest.raises(InputError, match="expected an address of this machine"):
         TcpSink("tcp://192.0.2.1:0")
+
+
+# What outlets have taken without the sink
+
+
+def test_a_udp_packet_that_was_refused_is_sent_again_and_the_one_before_counts_as_dropped(batch) -> None:
+    with receiver() as udp:
+        sink = UdpSink(f"udp://127.0.0.1:{udp.getsockname()[1]}")
+        (outlet,) = sink.outlets()
+        datagrams = batch(0, 30).datagrams
+        packets = [datagrams[: outlet.piece], datagrams[outlet.piece :]]
+        sink.written(batch(0, 30), [Written(outlet.piece, outlet.piece, errno.ECONNREFUSED)])
+        assert udp.recv(65536) == packets[1]
+        first = outlet.piece // SIZE
+        assert (sink.state.sent, sink.state.dropped, sink.state.queued) == (30 - first, first, 0)
+        assert sink.state.state == "nobody listens"
+        sink.close()
+
+
+def test_a_tcp_client_continues_within_a_datagram_and_is_no_outlet_until_its_queue_is_empty(
+    tcp, wait_for, batch
+) -> None:
+    with connect(tcp, wait_for) as client:
+        (outlet,) = tcp.outlets()
+        first, second = batch(0, 10), batch(10, 5)
+        cut = 3 * SIZE + 7
+        client_end = socket.socket(fileno=os.dup(outlet.fd))
+        with client_end:
+            assert client_end.send(first.datagrams[:cut]) == cut
+        tcp.written(first, [Written(cut, cut, 0)])
+        assert tcp.state.queued == 7
+        assert tcp.outlets() == []
+        tcp.written(second, [])
+        tcp.poll()
+        assert read(client, 15) == first.datagrams + second.datagrams
+        assert (tcp.state.sent, tcp.state.dropped, tcp.state.queued) == (15, 0, 0)
+        assert len(tcp.outlets()) == 1
+
+
+def test_a_tcp_client_whose_outlet_failed_is_removed_and_its_samples_are_counted(
+    tcp, wait_for, batch
+) -> None:
+    with connect(tcp, wait_for):
+        assert len(tcp.outlets()) == 1
+        tcp.written(batch(0, 4), [Written(SIZE, SIZE, errno.EPIPE)])
+        assert clients_of(tcp) == 0
+        assert (tcp.state.sent, tcp.state.dropped) == (1, 3)

@@ -51,7 +51,7 @@ def test_the_library_itself_reads_all_that_was_recorded(batch, tmp_path: Path) -
         recorder.arrived(Arrival(1000 + n, bytes([n]) * 44))
         recorder.publish(batch(n, 1))
     recorder.arrived(Arrival(2000, b""))
-    recorder.status({"rate_hz": 1000.0, "path": Path("x")})
+    recorder.status(lambda: {"rate_hz": 1000.0, "path": Path("x")})
     recorder.event(3000, "unplugged")
     recorder.calibration(4000, b"two: 2\n")
     recorder.close()

@@ -18,10 +18,15 @@ from .can import check_can, make_can
 from .candump import check_candump, make_candump
 from .chain import check_chain, make_chain
 from .datagram import check_datagram, make_datagram
+from .journal import check_journal, make_journal
+from .logs import check_log, make_log
 from .properties import Cuts, Setup
 from .random_input import random_cuts
+from .recordings import check_recording, make_recording
 from .settings import check_yaml, make_yaml
+from .status import check_status, make_status
 from .stream import check_stream, make_stream
+from .urls import check_port_url, make_url
 
 SHRINK_S: Final = 60.0
 """Time for reducing a failure."""
@@ -47,6 +52,11 @@ TARGETS: Final = (
     Target("yaml", make_yaml, check_yaml),
     Target("chain", make_chain, check_chain),
     Target("profiles", make_any_profile, check_any_profile),
+    Target("recording", make_recording, check_recording),
+    Target("log", make_log, check_log),
+    Target("url", make_url, check_port_url),
+    Target("journal", make_journal, check_journal),
+    Target("status", make_status, check_status),
 )
 
 

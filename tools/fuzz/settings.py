@@ -11,6 +11,9 @@ import numpy as np
 import yaml
 from numpy.random import Generator
 
+import calib
+from calib.procedure import plan
+from calib.procedure.schema import Procedure
 from imudrv.calibration import Calibration, coefficients
 from imudrv.errors import InputError
 from imudrv.files import model, settings_file
@@ -28,15 +31,18 @@ from .properties import Cuts, Setup
 from .random_input import mutated, pick, small_number
 from .units import SERIAL, SHIPPED, TEXTS, transmit
 
-MODELS: Final = (Calibration, Site, Profile, scenario.Scenario, Settings)
+MODELS: Final = (Calibration, Site, Profile, scenario.Scenario, Settings, Procedure)
+PROCEDURES: Final = Path(calib.__file__).parent / "procedures"
 SCENARIOS: Final = resources.files("imudrv.sim") / "scenarios"
 FILES: Final = (
     yaml.safe_dump(CALIBRATION),
     "{latitude_deg: 28.2, longitude_deg: 113, height_m: 60.0, gravity_m_s2: 9.7917}",
     "{port: a, profile: b, calibration: c.yaml, outputs: ['udp://a:1'], rate_filter: dither, realtime: true}",
     *TEXTS.values(),
+    *(path.read_text() for path in PROCEDURES.glob("*.yaml")),
     *((SCENARIOS / f"{name}.yaml").read_text() for name in scenario.shipped()),
 )
+SITE: Final = Site(latitude_deg=28.2, longitude_deg=113.0, height_m=60.0)
 ODD: Final[tuple[Any, ...]] = (
     *(None, True, 0, -1, 7, 1.5, 5e-324, 1e-9, 1e200, -1e308, np.inf, np.nan, 2**63, 10**25, [], {}),
     *("", "x", "\ud800", "\0", "é\u2028", "50\u00a026", "EB 90", "SerialLine", {"SerialLine": {"x": 1}}),
@@ -110,7 +116,10 @@ def check_yaml(_: Setup, data: bytes, __: Cuts) -> None:
 def use(settings: model.Model) -> None:
     """Do the first steps of a command with a good file."""
     rng = np.random.default_rng(0)
-    if isinstance(settings, scenario.Scenario):
+    if isinstance(settings, Procedure):
+        with contextlib.suppress(InputError):  # what it leaves unobservable
+            plan.predicted(settings, SITE)
+    elif isinstance(settings, scenario.Scenario):
         scenario.samples(settings, 1_000_000)
     elif isinstance(settings, Calibration):
         layout = SHIPPED[SERIAL[0]]

@@ -2,10 +2,13 @@
 
     tools/run python -m tools.soak all
     tools/run python -m tools.soak loopback [--seconds 60]     also loopback-can, loopback-canfd
-    tools/run python -m tools.soak fast [--seconds 5]          20 kHz
+    tools/run python -m tools.soak fast [--seconds 60]         20 kHz
+    tools/run python -m tools.soak fastest [--seconds 5]       100 kHz
+    tools/run python -m tools.soak outputs [--minutes 30]      all outputs at once
     tools/run python -m tools.soak faults [--seconds 20]       the same counts offline, live and recorded
     tools/run python -m tools.soak kill [--times 20]           recordings after kill -9
     tools/run python -m tools.soak unplug [--seconds 15]       and full disk, stuck and absent receivers
+    tools/run python -m tools.soak hostile [--minutes 30]      clients, calibrations, recordings, sockets
     tools/run python -m tools.soak hours [--hours 10]          in virtual time
 
 Run it in the folder of the project. Each test prints what is required and what was found; the exit code is 1
@@ -22,9 +25,11 @@ from typing import Final, NamedTuple
 
 from .checks import Check, StepError
 from .disruption import disruption
+from .hostile import hostile
 from .kill import kill
 from .line_faults import line_faults
 from .loopback import loopback
+from .outputs import outputs
 from .virtual_hours import virtual_hours
 
 
@@ -41,10 +46,13 @@ TESTS: Final = {
     "loopback": SoakTest(loopback, "--seconds", 60, "every sample, from a pty to UDP, at 1 kHz"),
     "loopback-can": SoakTest(partial(loopback, profile="imu50-can"), "--seconds", 60, "from a CAN bus"),
     "loopback-canfd": SoakTest(partial(loopback, profile="imu50-canfd"), "--seconds", 60, "from CAN FD"),
-    "fast": SoakTest(partial(loopback, speed=20.0), "--seconds", 5, "every sample at 20 kHz"),
+    "fast": SoakTest(partial(loopback, rate_hz=20_000), "--seconds", 60, "every sample at 20 kHz"),
+    "fastest": SoakTest(partial(loopback, rate_hz=100_000), "--seconds", 5, "every sample at 100 kHz"),
+    "outputs": SoakTest(outputs, "--minutes", 30, "UDP, eight TCP clients, serial and recording at once"),
     "faults": SoakTest(line_faults, "--seconds", 20, "the same counts offline, live and recorded"),
     "kill": SoakTest(kill, "--times", 20, "recordings after kill -9"),
     "unplug": SoakTest(disruption, "--seconds", 15, "unplugged port, full disk, stuck and absent receivers"),
+    "hostile": SoakTest(hostile, "--minutes", 30, "40 clients that do not read, calibrations, deleted files"),
     "hours": SoakTest(virtual_hours, "--hours", 10, "counts and memory over hours of virtual time"),
 }
 

@@ -20,7 +20,17 @@ FRAME: Final = LAYOUT.messages[0].length
 RATE_HZ: Final = 1000
 
 
-def write_scenario(folder: Path, duration_s: float, faults: dict[str, Any] | None = None) -> int:
+def profile_at(folder: Path, rate_hz: int) -> str:
+    """Write the profile of a serial unit of another sample rate; return its path."""
+    document = yaml.safe_load(profiles.load_file(SERIAL).content)
+    path = folder / "unit-profile.yaml"
+    path.write_text(yaml.safe_dump({**document, "name": f"imu50-{rate_hz}", "sample_rate_hz": rate_hz}))
+    return str(path)
+
+
+def write_scenario(
+    folder: Path, duration_s: float, faults: dict[str, Any] | None = None, rate_hz: int = RATE_HZ
+) -> int:
     """Write a rocking unit as ``scenario.yaml``; return its number of samples."""
     rock = {"duration_s": duration_s, "band_hz": [0.5, 3.0], "ramp_s": min(1.0, duration_s / 2.0)}
     document = {
@@ -33,7 +43,7 @@ def write_scenario(folder: Path, duration_s: float, faults: dict[str, Any] | Non
         "faults": faults or {},
     }
     (folder / "scenario.yaml").write_text(yaml.safe_dump(document))
-    return round(duration_s * RATE_HZ)
+    return round(duration_s * rate_hz)
 
 
 def encoded_frames(first: int, count: int) -> NDArray[np.uint8]:

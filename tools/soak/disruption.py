@@ -5,6 +5,7 @@ import resource
 import socket
 import subprocess
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from imudrv.recording.reader import Recording
 from imudrv.records import Flag, Records
 
 from .checks import TIMEOUT_S, Check, measured
-from .data import FRAME, RATE_HZ, SERIAL, difference, last_status, write_scenario
+from .data import FRAME, difference, last_status, profile_at, write_scenario
 from .processes import Stage, free_port, run_imudrv, run_ok
 from .usage import UsageMonitor, memory_checks
 
@@ -44,11 +45,14 @@ class Disk:
             resource.prlimit(pid, resource.RLIMIT_FSIZE, (self._limits[1], self._limits[1]))
 
 
-def disruption(folder: Path, seconds: float, speed: float = 10.0) -> list[Check]:
-    """Disturb a run at `speed` kHz."""
-    unplugged_s = 1.0
-    unplug = {"at_s": 0.3 * seconds * speed, "duration_s": unplugged_s * speed}
-    samples = write_scenario(folder, seconds * speed, {"unplugs": [unplug]})
+RATE_HZ: Final = 10_000
+_UNPLUGGED_S: Final = 1.0
+
+
+def disruption(folder: Path, seconds: float) -> list[Check]:
+    """Disturb a run."""
+    unplug = {"at_s": 0.3 * seconds, "duration_s": _UNPLUGGED_S}
+    samples = write_scenario(folder, seconds, {"unplugs": [unplug]}, RATE_HZ)
     good, absent, tcp = (free_port() for _ in range(3))
     outs = [f"udp://127.0.0.1:{good}", f"udp://127.0.0.1:{absent}", f"tcp://127.0.0.1:{tcp}"]
     path = folder / "disk" / "run.mcap"
@@ -56,7 +60,7 @@ def disruption(folder: Path, seconds: float, speed: float = 10.0) -> list[Check]
         disk = Disk(stage, path.parent, 400 * samples, 1_000_000)  # 250 bytes a sample are recorded
         listener = stage.listener(outs[0], "received.npy")
         options = [option for url in outs for option in ("--out", url)]
-        unit, service = stage.unit_and_service(SERIAL, f"{speed:g}", *options, "--record", path)
+        unit, service = stage.unit_and_service(profile_at(folder, RATE_HZ), "1", *options, "--record", path)
         pid = service.process.pid
         disk.fill(pid)
         stuck = stage.enter_context(socket.socket())
@@ -93,7 +97,7 @@ def disruption(folder: Path, seconds: float, speed: float = 10.0) -> list[Check]
     frames = sum(length for _, length in reads) // FRAME
     last_read_ns = max((t_ns for t_ns, _ in reads if t_ns <= reported_ns), default=0)
     report_s = 1e-9 * (reported_ns - last_read_ns)
-    recovery_s = (samples - counts.good) / RATE_HZ / speed - unplugged_s
+    recovery_s = (samples - counts.good) / RATE_HZ - _UNPLUGGED_S
     udp_sink, tcp_sink = status["sinks"][1:]
     differs = difference(recorded, folder / "offline.npz")
     return [

@@ -10,21 +10,35 @@ from imudrv.recording.reader import Recording
 from imudrv.records import Records
 
 from .checks import TIMEOUT_S, Check, measured
-from .data import SERIAL, difference, last_status, write_scenario
+from .data import RATE_HZ, SERIAL, difference, last_status, profile_at, write_scenario
 from .processes import Stage, free_port, run_ok
 from .usage import UsageMonitor, memory_checks
 
 CPU_PERCENT: Final = 15.0
 
 
-def loopback(folder: Path, seconds: float, profile: str = SERIAL, speed: float = 1.0) -> list[Check]:
-    """Play a unit for some seconds at `speed` kHz and compare what arrives with the offline command."""
-    samples = write_scenario(folder, seconds * speed)
+def loopback(folder: Path, seconds: float, profile: str = SERIAL, rate_hz: int = RATE_HZ) -> list[Check]:
+    """Play a unit for some seconds and compare what arrives with the offline command.
+
+    Parameters
+    ----------
+    folder : Path
+        Where everything is written.
+    seconds : float
+        Duration.
+    profile : str
+        Of the unit, at 1 kHz.
+    rate_hz : int
+        Another rate of the serial unit.
+    """
+    samples = write_scenario(folder, seconds, rate_hz=rate_hz)
+    if rate_hz != RATE_HZ:
+        profile = profile_at(folder, rate_hz)
     out = f"udp://127.0.0.1:{free_port()}"
     load = os.getloadavg()[0]
     with Stage(folder) as stage:
         listener = stage.listener(out, "received.npy")
-        unit, service = stage.unit_and_service(profile, f"{speed:g}", "--out", out, "--record", "run.mcap")
+        unit, service = stage.unit_and_service(profile, "1", "--out", out, "--record", "run.mcap")
         monitor = UsageMonitor(service.process.pid)
         unit.wait(TIMEOUT_S + 2.0 * seconds)
         usage = monitor.stop()
@@ -37,7 +51,7 @@ def loopback(folder: Path, seconds: float, profile: str = SERIAL, speed: float =
     report = run_ok("compensate", folder / "run.mcap", "-o", folder / "offline.npz")
     differs = difference(received, folder / "offline.npz")
     percent = 100.0 * (usage[-1].cpu_s - usage[0].cpu_s) / seconds
-    limit = CPU_PERCENT if speed == 1.0 else 100.0
+    limit = CPU_PERCENT if rate_hz == RATE_HZ else 100.0
     latency = (status["latency"][name] * 1e3 for name in ("p50_s", "p99_s", "p999_s", "max_s"))
     return [
         Check(

@@ -37,12 +37,21 @@ class Child:
             text=True,
         )
         self.lines: list[str] = []
+        self._hung_up = threading.Event()
         self._reader = threading.Thread(target=self._read)
         self._reader.start()
 
     def _read(self) -> None:
         assert self.process.stdout is not None
-        self.lines.extend(iter(self.process.stdout.readline, ""))
+        for line in self.process.stdout:
+            self.lines.append(line)
+            if self._hung_up.is_set():
+                self.process.stdout.close()
+                return
+
+    def hang_up(self) -> None:
+        """Close the pipe of what it prints, as `| head` does."""
+        self._hung_up.set()
 
     def _failed(self, what: str) -> StepError:
         return StepError(f"{self._name}: {what}: {''.join(self.lines[-9:])}")

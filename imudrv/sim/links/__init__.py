@@ -4,13 +4,14 @@ A line is a `pty`, a real port (`serial`), a `tcp` server or a `can` bus; `base`
 """
 
 from imudrv.errors import InputError
+from imudrv.loopback import LOOPBACK
 from imudrv.profiles.schema import CanLine, Profile
 from imudrv.sim.links.base import LineOptions, SimulatedLine
 from imudrv.sim.links.can import SimulatedCanBus
 from imudrv.sim.links.pty import SimulatedPty
 from imudrv.sim.links.serial import SimulatedSerialPort
 from imudrv.sim.links.tcp import SimulatedTcpServer
-from imudrv.url import LOOPBACK, device_path, host_and_port, serial_settings, split
+from imudrv.url import device_path, host_and_port, serial_settings, split
 
 
 def open_line(target: str, profile: Profile, options: LineOptions, link: str | None) -> SimulatedLine:

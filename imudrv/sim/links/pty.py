@@ -1,18 +1,16 @@
 """Pseudo terminal with an optional stable name."""
 
 import array
-import fcntl
 import os
 import secrets
 import select
-import termios
 import time
-import tty
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
 from imudrv.errors import InputError
+from imudrv.posix import fcntl, require_posix, termios, tty
 from imudrv.sim.links.base import READ_BYTES, RETRY_S, TIMEOUT_S, FileLine, LineOptions
 
 SETTLE_S: Final = 0.25
@@ -37,6 +35,7 @@ class SimulatedPty(FileLine):
 
     def __init__(self, options: LineOptions, link: str | None) -> None:
         super().__init__(options)
+        require_posix("port pty", "use tcp://127.0.0.1:PORT instead")
         self._link = Path(link) if link is not None else None
         if self._link is not None and self._link.exists() and not self._link.is_symlink():
             raise InputError(f"link {link}: expected an unused name, got a file; choose another name")

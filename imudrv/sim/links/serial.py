@@ -7,6 +7,7 @@ from typing import Any
 import serial
 
 from imudrv.errors import InputError
+from imudrv.posix import require_posix
 from imudrv.sim.links.base import RETRY_S, TIMEOUT_S, FileLine, LineOptions
 
 
@@ -30,6 +31,7 @@ class SimulatedSerialPort(FileLine):
 
     def __init__(self, options: LineOptions, path: str, settings: dict[str, Any]) -> None:
         super().__init__(options)
+        require_posix(path, "use tcp://127.0.0.1:PORT instead")
         self._path = path
         self._settings = settings
         self._port: serial.Serial | None = None

@@ -1,4 +1,4 @@
-"""The stages in a row, and the exchange of a calibration between two samples."""
+"""A calibration is replaced between two samples; any pieces give the same bits."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -6,9 +6,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from imudrv.chain import Chain
 from imudrv.imu.coefficients import Coefficients
 from imudrv.imu.rate_filter import RateFilterName, rate_filter
-from imudrv.pipeline import Pipeline
 from imudrv.profiles import load
 from imudrv.records import PULSES, Flag, Records
 from imudrv.units import ARCSEC
@@ -39,9 +39,9 @@ def wire() -> list[bytes]:
     return [row.tobytes() for row in StreamEncoder(PROFILE.layout()).encode(pulses)]
 
 
-def through(pipeline: Pipeline, frames: list[bytes], first: int = 0) -> list[Records]:
+def through(chain: Chain, frames: list[bytes], first: int = 0) -> list[Records]:
     return [
-        pipeline.feed(frame, (first + k + 1) * TAU_NS + 400_000).increments for k, frame in enumerate(frames)
+        chain.feed(frame, (first + k + 1) * TAU_NS + 400_000).increments for k, frame in enumerate(frames)
     ]
 
 
@@ -52,16 +52,16 @@ def test_a_calibration_is_replaced_without_a_sample_lost_doubled_or_left_uncompe
 ) -> None:
     frames = wire()
     rates = rate_filter(name, TAU_NS)
-    pipeline = Pipeline(PROFILE, old, name)
-    before = through(pipeline, frames[:200])
-    pipeline.replace_calibration(new)
-    after = through(pipeline, frames[200:], 200)
-    got = np.concatenate([*before, *after, pipeline.close().increments])
+    chain = Chain(PROFILE, old, name)
+    before = through(chain, frames[:200])
+    chain.replace_calibration(new)
+    after = through(chain, frames[200:], 200)
+    got = np.concatenate([*before, *after, chain.close().increments])
 
     assert got["counter"].tolist() == list(range(SAMPLES))
     alone = [
         np.concatenate([*through(p, frames), p.close().increments])
-        for p in (Pipeline(PROFILE, old, name), Pipeline(PROFILE, new, name))
+        for p in (Chain(PROFILE, old, name), Chain(PROFILE, new, name))
     ]
     same = [np.all(got["dv_b"] == a["dv_b"], axis=1) for a in alone]
     switched = int(np.argmin(same[0]))
@@ -79,8 +79,8 @@ def test_any_pieces_give_the_same_bits() -> None:
     rng = np.random.default_rng(3)
     results = []
     for cuts in ([0, len(data)], [0, *np.sort(rng.integers(0, len(data), 90)).tolist(), len(data)]):
-        pipeline = Pipeline(PROFILE, ARMS, "dither")
-        parts = [pipeline.feed(data[a:b], 0).increments for a, b in pairwise(cuts)]
-        results.append(np.concatenate([*parts, pipeline.close().increments]))
+        chain = Chain(PROFILE, ARMS, "dither")
+        parts = [chain.feed(data[a:b], 0).increments for a, b in pairwise(cuts)]
+        results.append(np.concatenate([*parts, chain.close().increments]))
     for name in ("counter", "dtheta_b", "dv_b", "interval_ns"):
         np.testing.assert_array_equal(results[0][name], results[1][name])

@@ -1,0 +1,23 @@
+"""The kernels that this package calls beside those of navigation; see `imudrv.kernel_parts`."""
+
+import numpy as np
+
+from calib.detection.blocks import Block, BlockSums
+from calib.detection.tracking import AttitudeTracker, RestAverages, RotationTracker, StillnessDetector
+from imudrv.records import INCREMENTS
+
+
+def detection() -> None:
+    """Detection of rests and rotations, during the procedure and in a capture."""
+    increments = np.zeros(1, INCREMENTS)
+    BlockSums(0, 20).feed(increments)
+    block = Block(increments, 0, 0.02, (0.0, 0.0, 1e-6), (0.0, 0.0, 9.8), 0, 0, False, False)
+    up = np.array([0.0, 0.0, 1.0])
+    attitude, turned = AttitudeTracker(0.0), RotationTracker()
+    for tracker in (attitude, turned, RestAverages(), StillnessDetector(1.0, 1.0)):
+        tracker.feed(block)
+    attitude.q_nb = (1.0, 0.0, 0.0, 0.0)
+    attitude.feed(block)
+    attitude.lean(up)
+    attitude.azimuth(up)
+    _ = turned.axis_tilt
