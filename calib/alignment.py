@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.axes import axis_name
 from calib.detection.segments import find_segments
-from calib.estimation.runs import Priors
+from calib.estimation.priors import Priors
 from calib.identification import PriorCalibration, prior_calibration
 from calib.inputs import StrPath, profile_of, require_six_axes, site_of
 from imudrv.arrays import Array

@@ -20,9 +20,9 @@ from imudrv.sensor_calibration import Noise, SensorsProvenance, number_paths
 from imudrv.units import ARCSEC, DEG_PER_H, MM, MS, PPM, STANDARD_GRAVITY, UG
 
 NORM_TOLERANCE: Final = 0.1
-"""Largest deviation from 1 of the length of a row or column of an axes matrix."""
-MIN_DETERMINANT: Final = 0.5
-"""Smallest determinant of an axes matrix: axes may be turned, but neither mirrored nor parallel."""
+"""Largest deviation from 1 of the length of a sensing axis, a row of the inverse of an axes matrix."""
+MIN_DETERMINANT: Final = 0.3
+"""Smallest determinant of the sensing axes: they may be any that span space, but not mirrored."""
 GAUGE_TOLERANCE_MM: Final = 1e-5
 """Largest deviation from the stated gauge: ten times the rounding to six decimals."""
 COVARIANCE_TOLERANCE_MM2: Final = 5e-6
@@ -40,18 +40,23 @@ Matrix9: TypeAlias = tuple[Row9, Row9, Row9, Row9, Row9, Row9, Row9, Row9, Row9]
 
 def _axes(matrix: Matrix3) -> Matrix3:
     C = np.array(matrix)
-    with np.errstate(over="ignore"):  # infinity is reported below
-        norms = np.concatenate([np.linalg.norm(C, axis=1), np.linalg.norm(C, axis=0)])
+    with np.errstate(over="ignore", invalid="ignore"):
+        determinant = float(np.linalg.det(C))
+    if not 1e-6 < abs(determinant) < 1e6:
+        raise ValueError(f"expected three independent axes, got a matrix of determinant {determinant:.3g}")
+    sensing = np.linalg.inv(C)  # rows: the sensing axes
+    norms = np.linalg.norm(sensing, axis=1)
     worst = norms[np.argmax(np.abs(norms - 1.0))]
     if abs(worst - 1.0) > NORM_TOLERANCE:
         raise ValueError(
-            f"expected rows and columns of a length within {NORM_TOLERANCE:g} of 1, got one of {worst:.4g}; "
-            "scale belongs to the scale factors"
+            f"expected rows of the inverse, the sensing axes, of a length within {NORM_TOLERANCE:g} of 1, "
+            f"got one of {worst:.4g}; scale belongs to the scale factors"
         )
-    determinant = np.linalg.det(C)
+    determinant = float(np.linalg.det(sensing))
     if abs(determinant) < MIN_DETERMINANT:
         raise ValueError(
-            f"expected three independent axes, determinant >= {MIN_DETERMINANT:g}, got {determinant:.3g}"
+            "expected three independent sensing axes, determinant of the inverse >= "
+            f"{MIN_DETERMINANT:g}, got {determinant:.3g}"
         )
     if determinant < 0.0:
         raise ValueError(

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from calib.estimation.runs import Priors
+from calib.estimation.priors import Priors
 from calib.validation.montecarlo import BUDGETS, run_cases
 
 

@@ -12,7 +12,8 @@ from calib.bench.state import REPORT, RESULT
 from calib.certificate import check_target, write
 from calib.lever_arms.gauge import convert
 from calib.messages import Message, english, message
-from calib.reports.identification import arms_text, report_html, verdict
+from calib.reports.identification import arms_text, report_html
+from calib.reports.verdict import verdict
 from imudrv.calibration import Calibration, read_calibration
 from imudrv.errors import InputError
 from imudrv.files import atomic, settings_file

@@ -11,8 +11,9 @@ from calib.detection.acceptance import rejection_reasons
 from calib.detection.blocks import BLOCK_NS, Block
 from calib.detection.segments import LEAST_FORCE, QUIET_S, SIGMAS, Rotation
 from calib.detection.tracking import MG, RestAverages
-from calib.estimation.linear_system import GAIN_WINDOW_S
-from calib.estimation.runs import GUARD_S, Priors
+from calib.estimation.gains import GAIN_WINDOW_S
+from calib.estimation.priors import Priors
+from calib.estimation.runs import GUARD_S
 from calib.messages import Message, message
 from calib.procedure import prompts
 from calib.procedure.attempt import Attempt

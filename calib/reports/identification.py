@@ -10,18 +10,19 @@ from math import hypot
 from typing import Final
 
 import numpy as np
-from scipy.special import chdtri
 
-from calib.estimation.result import LeverArmEstimate, ParameterEstimate, TurnResult
-from calib.estimation.runs import Priors, Run
+from calib.estimation.priors import Priors
+from calib.estimation.result import LeaveOneOut, LeverArmEstimate, ParameterEstimate, TurnResult
+from calib.estimation.runs import Run
 from calib.identification import CaptureSummary, IdentificationResult, scatter
 from calib.lever_arms.gauge import LeverArms
-from calib.messages import Message, english, message, verbatim
+from calib.messages import english
 from calib.reports import figures
 from calib.reports.document import Block, Document, Figure, KeyValues, Paragraph, Section, Table, sanitise
 from calib.reports.format import counted, decimals, mm, three_digits
 from calib.reports.html import as_html
 from calib.reports.text import blocks_text
+from calib.reports.verdict import redundancy_mark, scatter_mark, verdict
 from imudrv.arrays import Array
 from imudrv.units import ARCSEC, DEG, DEG_PER_H, MM, PPM, STANDARD_GRAVITY, UG, URAD
 
@@ -110,79 +111,6 @@ def _arms_table(arms: LeverArms) -> Table:
             for i, r, row in zip("xyz", arms.r_b, sigma, strict=True)
         ),
     )
-
-
-def verdict(identification: IdentificationResult) -> Iterator[tuple[str, Message]]:
-    """Evaluate an identification.
-
-    Parameters
-    ----------
-    identification : IdentificationResult
-        Result of the identification.
-
-    Yields
-    ------
-    (str, Message)
-        'good', 'note', 'caution' or 'bad', and a sentence that gives the reason.
-    """
-    result = identification.result
-    parts = message("nine_components") if result.gauge == "given" else message("six_differences")
-    yield (
-        "good",
-        message(
-            "determined",
-            parts=parts,
-            rotations=len(result.turns),
-            method=result.method,
-            worst_mm=float(result.differences_sigma.max()) / MM,
-        ),
-    )
-    if result.consistent:
-        yield _agreement(result)
-    for refusal in result.refusals:
-        yield "bad", message("refused", why=verbatim(sanitise(refusal[0].upper() + refusal[1:])))
-    yield "note", _redundancy(result)
-    for n in result.parameters:
-        if n.name == "skew_s" and not n.observable:
-            yield "note", message("skew_unknown", prior_ms=n.prior * 1e3)
-    for k, run in enumerate(identification.runs):
-        if run.aligned.motion is not None:
-            motion = verbatim(sanitise(str(run.aligned.motion)))
-            yield "caution", message("run_moved", run=k + 1, motion=motion)
-    for note in result.notes:
-        yield "caution", verbatim(f"{sanitise(note)}.")
-
-
-def _redundancy(result: LeverArmEstimate) -> Message:
-    """Return how far the rotations check each other."""
-    shifts = [
-        (float(np.abs(one.shift_m).max()), one.label)
-        for one in result.leave_one_out
-        if one.shift_m is not None
-    ]
-    if not shifts:
-        return message("not_checked")
-    shift, label = max(shifts, key=lambda item: item[0])
-    return message("omitted", shift_mm=shift / MM, label=sanitise(label))
-
-
-def _agreement(result: LeverArmEstimate) -> tuple[str, Message]:
-    n = result.degrees_of_freedom
-    if n == 0:
-        return "caution", message("no_residuals")
-    low, high = float(chdtri(n, 0.975)), float(chdtri(n, 0.025))
-    statistic = message("chi_square", value=result.chi_square, n=n, low=low, high=high)
-    if not result.consistent:
-        return "bad", message("contradicted", statistic=statistic)
-    if result.chi_square > high:
-        return "caution", message(
-            "residuals_large", statistic=statistic, factor=(result.chi_square / n) ** 0.5
-        )
-    if result.chi_square < low:
-        return "note", message("residuals_small", statistic=statistic)
-    if 2 * len(result.turns) <= 6:  # two equations per rotation for six differences: none checks the arms
-        return "good", message("rests_agree", statistic=statistic)
-    return "good", message("velocities_agree", statistic=statistic)
 
 
 def _inputs(identification: IdentificationResult) -> Iterator[Block]:
@@ -326,7 +254,7 @@ def _speed(v_n: Array) -> float:
 def _estimate(identification: IdentificationResult) -> Iterator[Block]:
     result = identification.result
     yield from _observability(result, identification.priors.arm)
-    yield Paragraph(f"Consistency. {english(_agreement(result)[1])}")
+    yield Paragraph(" ".join(map(english, (scatter_mark(result).text, redundancy_mark(result).text))))
     yield _noise(result)
     yield Table("Prior uncertainties", ("", "u"), tuple(priors_rows(identification.priors)))
     if result.parameters:
@@ -363,12 +291,12 @@ def _noise(result: LeverArmEstimate) -> KeyValues:
         (
             (
                 "gyros",
-                f"angle random walk {noise.angle_walk / DEG * 60.0:.5f} deg/sqrt(h), estimated in the rests",
+                f"angle random walk {noise.angle_walk / DEG * 60.0:.5f} deg/sqrt(h), from the alignments",
             ),
             (
                 "accelerometers",
-                f"horizontal: velocity random walk {noise.velocity_walk * 60.0:.5f} m/s/sqrt(h), white noise "
-                f"{mm(noise.velocity_white, '.4f')} mm/s, estimated in the rests",
+                f"horizontal: velocity random walk {noise.velocity_walk * 60.0:.5f} m/s/sqrt(h), from the "
+                "alignments",
             ),
         )
     )
@@ -376,21 +304,22 @@ def _noise(result: LeverArmEstimate) -> KeyValues:
 
 def _leave_one_out(result: LeverArmEstimate) -> Table:
     return Table(
-        "Largest change of r_x, r_y, r_z if one rotation is omitted, mm",
-        ("without", "rank", "r_x", "r_y", "r_z"),
-        tuple(
-            (
-                sanitise(one.label),
-                str(one.rank),
-                *(
-                    ("unobservable",) * 3
-                    if one.shift_m is None
-                    else (mm(np.abs(row).max(), ".3f") for row in one.shift_m)
-                ),
-            )
-            for one in result.leave_one_out
-        ),
+        "Largest change of r_x, r_y, r_z if one rotation is omitted, mm, and its u; p of its agreement",
+        ("without", "rank", "r_x", "u", "r_y", "u", "r_z", "u", "p"),
+        tuple((sanitise(one.label), str(one.rank), *_shifts(one)) for one in result.leave_one_out),
     )
+
+
+def _shifts(one: LeaveOneOut) -> Iterator[str]:
+    if one.shift_m is None or one.sigma_m is None or one.test is None:
+        yield from ("unobservable", "") * 3
+        yield ""
+        return
+    for shift, sigma in zip(np.abs(one.shift_m), one.sigma_m, strict=True):
+        at = int(shift.argmax())
+        yield mm(float(shift[at]), ".4f")
+        yield mm(float(sigma[at]), ".4f")
+    yield f"{one.test.p_value:.2g}"
 
 
 def _correlations(identification: IdentificationResult, names: Sequence[str]) -> Table:
@@ -436,23 +365,37 @@ def _limits(identification: IdentificationResult, arms: LeverArms) -> Iterator[s
 
 def priors_rows(priors: Priors) -> Iterator[tuple[str, str]]:
     """Return names and values of the priors, in the usual units."""
-    yield "accelerometer bias", f"{priors.accelerometer_bias / UG:g} ug"
-    yield "accelerometer scale", f"{priors.accelerometer_scale / PPM:g} ppm"
-    yield "accelerometer misalignment", f"{priors.accelerometer_misalignment / URAD:g} urad"
-    yield "gyro bias", f"{priors.gyro_bias / DEG_PER_H:g} deg/h"
-    yield "gyro scale", f"{priors.gyro_scale / PPM:g} ppm"
-    yield "gyro misalignment", f"{priors.gyro_misalignment / URAD:g} urad"
-    yield "gyro-accelerometer skew", f"{priors.skew * 1e3:g} ms"
+    if priors.covariance is not None:
+        yield "biases, scales, misalignments", "covariance of the certificate"
+    else:
+        yield "accelerometer bias", f"{priors.accelerometer_bias / UG:g} ug"
+        yield "accelerometer scale", f"{priors.accelerometer_scale / PPM:g} ppm"
+        yield "accelerometer misalignment", f"{priors.accelerometer_misalignment / URAD:g} urad"
+        yield "gyro bias", f"{priors.gyro_bias / DEG_PER_H:g} deg/h"
+        yield "gyro scale", f"{priors.gyro_scale / PPM:g} ppm"
+        yield "gyro misalignment", f"{priors.gyro_misalignment / URAD:g} urad"
+    yield "accelerometer bias from run to run", f"{priors.accelerometer_bias_of_run / UG:g} ug"
+    yield "gyro bias from run to run", f"{priors.gyro_bias_of_run / DEG_PER_H:g} deg/h"
+    skew = f"{priors.skew * 1e3:g} ms"
+    yield (
+        "gyro-accelerometer skew",
+        skew if not priors.expected_skew else f"{skew} about {priors.expected_skew * 1e3:g} ms",
+    )
 
 
 def _names(result: LeverArmEstimate) -> list[str]:
     """Return readable names of the parameters, with runs by number."""
-    runs = {f"phi {run.label}": f"run {k + 1}" for k, run in enumerate(result.runs)}
+    runs = {run.label: f"run {k + 1}" for k, run in enumerate(result.runs)}
     tilts = {"east": "tilt about east", "north": "tilt about north", "up": "heading"}
     names = []
     for parameter in result.parameters:
         head, _, part = parameter.name.rpartition("_")
-        names.append(f"{runs[head]} {tilts[part]}" if head in runs else parameter.name.replace("_", " "))
+        kind, _, label = head.partition(" ")
+        if label in runs:
+            kind = kind.replace("_", " ")
+            names.append(f"{runs[label]} {tilts[part] if kind == 'phi' else f'{kind} {part}'}")
+        else:
+            names.append(parameter.name.replace("_", " "))
     return names
 
 

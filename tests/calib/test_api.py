@@ -107,7 +107,7 @@ def test_the_options_choose_the_method(here: Path, result: IdentificationResult)
 
 
 def test_one_capture_is_a_list_of_one(here: Path) -> None:
-    with pytest.raises(InputError, match="expected rotations that determine 6 directions"):
+    with pytest.raises(InputError, match="Z up alone is not enough: add captures with X up and Y up"):
         calib.identify("z_up.raw", calibration="unit.yaml", site="site.yaml", profile=PROFILE)
 
 

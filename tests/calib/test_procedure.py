@@ -45,9 +45,10 @@ def test_a_prediction_is_shown_before_anyone_lifts_anything(site: Site) -> None:
     told = {name: predicted(load(name), site) for name in shipped()}
     rms = {name: np.sqrt(np.trace(told[name].covariance) / 9.0) / MM for name in told}
 
-    # mathematics, section 4: 0.024 to 0.045 mm rms with three rotations; twice as many gain a root of 2
-    assert 0.024 < rms["three-rotations"] < 0.045
-    assert rms["six-rotations"] == pytest.approx(rms["three-rotations"] / 2**0.5, rel=0.1)
+    # mathematics, section 4: 0.045 mm rms at most with three rotations; twice as many gain a root of 2, and
+    # determine the skew
+    assert 0.01 < rms["three-rotations"] < 0.045
+    assert rms["six-rotations"] < rms["three-rotations"] / 2**0.5
     assert told["six-rotations"].differences_sigma.shape == (2, 3)
 
 

@@ -11,7 +11,7 @@ import pytest
 from calib.bench.technician import Mistake, technician_scenario
 from calib.estimation.joint import estimate_joint
 from calib.estimation.result import TO_DIFFERENCES, LeverArmEstimate
-from calib.estimation.runs import NavigationOptions, navigate_rotations
+from calib.estimation.runs import NavigationOptions, Pulses, navigate_rotations
 from calib.messages import english
 from calib.procedure.engine import Engine
 from calib.procedure.events import Accepted, Event, Finished, Phase, Rejected, Restarted, Turned
@@ -53,6 +53,7 @@ class Performance:
         """From the samples that the accepted events name, as from a recording."""
         calibration = self.scenario.unit.calibration
         assert calibration is not None
+        known = coefficients(calibration)
         runs = []
         for step in self.procedure.steps:
             accepted = self.engine.accepted[step.id]
@@ -64,6 +65,7 @@ class Performance:
                 self.scenario.site,
                 step.id,
                 NavigationOptions(self.procedure.rotation_limits(step), expected=step.up[1]),
+                Pulses(known.gyro_scale, 1.0 / known.accelerometer_scale, np.linalg.inv(known.C_bg)),
             )
             assert len(navigated.runs) == 1
             outside = [r for r, _ in navigated.rejected if abs(r.angle_deg) > 10.0]  # a bump is no turn
@@ -120,7 +122,8 @@ def assert_identified(performance: Performance) -> None:
     assert np.all(np.abs(error) < 3.0 * sigma), error / sigma
     # hands turn a little slower than the plan, the noise is that of the run; a skew acts along where the unit
     # stands from the axis, which no plan knows, so that the sum is compared and not each difference
-    assert np.linalg.norm(sigma) < 1.25 * np.linalg.norm(promised), sigma / promised
+    # the plan assumes that pulses arrive whenever they are wanted; this unit is nearly level
+    assert np.linalg.norm(sigma) < 1.5 * np.linalg.norm(promised), sigma / promised
     assert np.sqrt((error**2).mean()) < 0.08 * MM
 
 
