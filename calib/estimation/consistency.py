@@ -3,11 +3,13 @@
 With a free step of velocity at every turn the arms have no effect on the fit. Then
 
     scatter      chi-square of that fit: whether the velocity within each rest is as the noise makes it.
-                 Degrees of freedom: the readings less two for each turn.
+                 Degrees of freedom: the readings less two for each turn, and less the parameters of the runs.
     redundancy   what chi-square grows by when the steps are zero and the arms explain the velocities: whether
                  the turns agree on the arms. 2 n - d degrees of freedom for n turns and d components of R.
 
-A prior is an equation for a parameter and adds no degree of freedom. The noise itself is an estimate with f
+The prior of an error of the calibration is an equation for a parameter: it adds no degree of freedom. The
+priors of the parameters of the runs are bounds, far wider than what they allow for, so that each such
+parameter takes a degree of freedom as far as the data determine it. The noise itself is an estimate with f
 degrees of freedom, so that the scatter follows an F distribution.
 
 **Each turn against the others.** Freeing the step of one turn takes it out. The arms shift by the difference
@@ -28,7 +30,13 @@ _NO_ARMS = np.zeros((9, 0))
 
 
 def scatter_and_redundancy(
-    system: NormalEquations, x: Array, basis: Array, noise: SensorNoise, *, in_motion: bool
+    system: NormalEquations,
+    x: Array,
+    covariance: Array,
+    basis: Array,
+    noise: SensorNoise,
+    *,
+    in_motion: bool,
 ) -> tuple[ChiSquare | None, ChiSquare]:
     """Return the two tests of an estimate.
 
@@ -36,7 +44,7 @@ def scatter_and_redundancy(
     ----------
     system : NormalEquations
         Equations of the session.
-    x : ndarray
+    x, covariance : ndarray
         Its solution.
     basis : ndarray, shape (9, d)
         Basis of the arms that were solved for.
@@ -51,16 +59,25 @@ def scatter_and_redundancy(
         Scatter, or None, and redundancy.
     """
     if in_motion:
-        freedom = system.count - basis.shape[1]
+        freedom = system.count - basis.shape[1] - _determined(system, covariance)
         return None, ChiSquare(system.chi_square(x), freedom, noise.degrees_of_freedom)
-    free, _ = system.solve(_NO_ARMS, system.turns)
+    free, spread = system.solve(_NO_ARMS, system.turns)
     scatter = system.chi_square(free)
     all_turns = sum(len(part.accepted) for part in system.parts)
     redundant = max(0, 2 * len(system.turns) - basis.shape[1])
     return (
-        ChiSquare(scatter, system.count - 2 * all_turns, noise.degrees_of_freedom),
+        ChiSquare(
+            scatter, system.count - 2 * all_turns - _determined(system, spread), noise.degrees_of_freedom
+        ),
         ChiSquare(system.chi_square(x) - scatter if redundant else 0.0, redundant),
     )
+
+
+def _determined(system: NormalEquations, covariance: Array) -> int:
+    """Return how many parameters of the runs the data determine."""
+    prior = np.diag(system.parameters.covariance)
+    posterior = np.diag(covariance)[9 : 9 + len(prior)]
+    return round(float((1.0 - posterior / prior)[system.parameters.shared :].sum()))
 
 
 def leave_one_out(

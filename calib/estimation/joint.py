@@ -108,7 +108,9 @@ def estimate_joint(
     sigma, _ = system.directions()
     x, covariance = system.solve(basis)
     R = x[:9]
-    scatter, redundancy = scatter_and_redundancy(system, x, basis, noise, in_motion=pivot == "fixed")
+    scatter, redundancy = scatter_and_redundancy(
+        system, x, covariance, basis, noise, in_motion=pivot == "fixed"
+    )
     if pivot == "fixed":
         _check_pivot(system, x)
     cut = 9 + len(parameters.names)

@@ -48,9 +48,9 @@ ROWS_PER_POINT: Final = 5
 """With a known pivot, every n-th row during the motion also becomes an equation."""
 
 
-TURN_SHARE: Final = 12.0 * 0.015**2
+TURN_SHARE: Final = 12.0 * 0.008**2
 """Variance that the pulses add at each turn, over that of the unknown fraction of a pulse at the start: what
-a spline through the pulses is off by, turned into other axes, is 1.5 % of a pulse in simulations."""
+the motion between the pulses is off by, turned into other axes, is 0.8 % of a pulse in simulations."""
 
 
 LEAST_MOTION: Final = 3e-5

@@ -128,7 +128,9 @@ def predict(
     priors = priors or Priors()
     if not plan:
         raise InputError("plan: expected at least one rotation, got none")
-    runs = [_planned_run(planned, k, latitude_rad, priors) for k, planned in enumerate(plan)]
+    runs = [
+        _planned_run(planned, k, latitude_rad, priors, noise.velocity_walk) for k, planned in enumerate(plan)
+    ]
     terms = extra_terms(priors, ())
     equations = [run_equations(run, noise, "free", Design(run, terms, _known(run))) for run in runs]
     system = NormalEquations(equations, prior_parameters(runs, priors, terms))
@@ -145,7 +147,7 @@ def _known(run: Run) -> Known:
     return Known(R, run.rows["H"] @ R)
 
 
-def _planned_run(planned: PlannedRotation, k: int, latitude_rad: float, priors: Priors) -> Run:
+def _planned_run(planned: PlannedRotation, k: int, latitude_rad: float, priors: Priors, walk: float) -> Run:
     """Return the ideal run of a planned rotation: level, about the vertical, without errors."""
     T, n = _PLAN_INTERVAL_NS * NS, round(planned.duration_s / (_PLAN_INTERVAL_NS * NS))
     before, after = round(BEFORE_S / T), round(min(planned.after_s, AFTER_S) / T)
@@ -223,7 +225,7 @@ def _planned_run(planned: PlannedRotation, k: int, latitude_rad: float, priors: 
         rows["v_n"],
         (counter + 1) * T,
         (inside[0] <= counter) & (counter < inside[1]),
-        read_rests(rests, np.eye(3), np.zeros(3)),
+        read_rests(rests, np.eye(3), np.zeros(3), walk),
         RestReadings(gravity, 0.0, *earth_rate_n(latitude_rad)[:0:-1], 0.0),
         WalkEstimate(0.0, 0),
         WalkEstimate(0.0, 0),

@@ -25,6 +25,7 @@ from calib.estimation.low_pass import FilterChoice, chosen_filter, low_passed, w
 from calib.estimation.priors import Priors
 from calib.estimation.pulses import without_quantisation
 from calib.estimation.readings import Readings, RestSamples, level_channels, read_rests
+from calib.estimation.rigid_motion import rigid_motion
 from calib.estimation.walk import WalkEstimate, random_walk
 from imudrv.arrays import Array
 from imudrv.calibration import Calibration, coefficients
@@ -359,19 +360,10 @@ class _RunBuilder:
         navigator = Navigator(setup.site.place, aligned.q_nb, C_ba=setup.C_ba)
         samples, A = smooth[begin:stop], np.asarray(np.linalg.inv(setup.C_ba), np.float64)
         dv_a = samples["dv_b"] @ A.T
-        t_s = self._time(samples["counter"])
-        smooth_a = [
-            without_quantisation(t_s, *of) for of in zip(dv_a.T, setup.pulses.accelerometer, strict=True)
-        ]
-        samples["dv_b"] = np.transpose(smooth_a) @ setup.C_ba.T
         every = max(1, round(BLOCK_NS * NS / self._interval_s))
-        kept, velocities = [np.zeros(0, MEASUREMENT)], []
-        size = max(1, _AT_ONCE // every) * every
-        for at in range(0, len(samples), size):
-            rows = navigator.feed(samples[at : at + size])
-            kept.append(rows[every - 1 :: every].copy())
-            velocities.append(rows["v_n"].copy())
-        rows, v_n = np.concatenate(kept), np.concatenate(velocities)
+        rows, v_n, q_nb = _navigated(navigator, samples, every)
+        v_n += self._correction(samples, dv_a, q_nb, A)
+        rows["v_n"] = v_n[every - 1 :: every]
         counter, guard = rows["counter"], round(GUARD_S / self._interval_s)
         begins = [self._begin, *(turn.stop + guard for turn in self._turns)]
         ends = [*(turn.start - guard for turn in self._turns), self._stop]
@@ -381,7 +373,8 @@ class _RunBuilder:
         # dither hides the pulses
         gyro = smooth[begin - len(still) : begin] if lines else still
         gyro_pulse = np.zeros(3) if lines else setup.pulses.gyro
-        time, up_b = self._time(still["counter"]), self._turns[0].before.up_b
+        time = self._time(still["counter"])
+        velocity_walk = self._velocity_walk(time, still["dv_b"] @ A.T, A @ self._turns[0].before.up_b)
         return Run(
             self._label,
             self._turns,
@@ -392,13 +385,24 @@ class _RunBuilder:
             v_n[: len(rows) * every].reshape(len(rows), every, 3).mean(axis=1),
             self._time(counter),
             np.array([(begin <= counter) & (counter < end) for begin, end in zip(begins, ends, strict=True)]),
-            read_rests(rests, A, setup.pulses.accelerometer),
+            read_rests(rests, A, setup.pulses.accelerometer, velocity_walk.root),
             self._alignment.readings(),
             random_walk(time, gyro["dtheta_b"] @ setup.pulses.G.T, gyro_pulse, range(3)),
-            self._velocity_walk(time, still["dv_b"] @ A.T, A @ up_b),
+            velocity_walk,
             lines,
             self._filter,
         )
+
+    def _correction(self, samples: Records, dv_a: Array, q_nb: Array, A: Array) -> Array:
+        """Return what the velocity is to be corrected by for the fractions of pulses, m/s, in n."""
+        pulse = self._setup.pulses.accelerometer
+        t_s, C_nb = self._time(samples["counter"]), _matrices(q_nb)
+        corrected = np.zeros_like(dv_a)
+        for i in np.flatnonzero(pulse):
+            motion = rigid_motion(t_s, C_nb, samples["dtheta_b"], A[i], self._setup.site.gravity)
+            corrected[:, i] = without_quantisation(t_s, dv_a[:, i], float(pulse[i]), motion) - dv_a[:, i]
+        middle = 0.5 * (C_nb + np.concatenate([C_nb[:1], C_nb[:-1]])) @ self._setup.C_ba
+        return np.asarray(np.cumsum(np.einsum("nij,nj->ni", middle, corrected), axis=0), np.float64)
 
     def _velocity_walk(self, t_s: Array, dv_a: Array, up_a: Array) -> WalkEstimate:
         """Return the random walk of the level accelerometers; of all, if those send no pulses."""
@@ -418,6 +422,23 @@ class _RunBuilder:
         rests = []
         for begin, end in zip(at[::2], at[1::2], strict=True):
             middle = rows[np.searchsorted(rows["counter"], counter[(begin + end) // 2])]
-            C_nb = Attitude.from_quat(np.roll(middle["q_nb"], -1)).as_matrix()
+            C_nb = _matrices(middle["q_nb"])
             rests.append(RestSamples(self._time(counter[begin:end]), v_n[begin:end], dv_a[begin:end], C_nb))
         return rests
+
+
+def _navigated(navigator: Navigator, samples: Records, every: int) -> tuple[Records, Array, Array]:
+    """Return every n-th row of MEASUREMENT, and velocity and attitude of all samples."""
+    kept, velocities, attitudes = [np.zeros(0, MEASUREMENT)], [np.zeros((0, 3))], [np.zeros((0, 4))]
+    size = max(1, _AT_ONCE // every) * every
+    for at in range(0, len(samples), size):
+        rows = navigator.feed(samples[at : at + size])
+        kept.append(rows[every - 1 :: every].copy())
+        velocities.append(rows["v_n"].copy())
+        attitudes.append(rows["q_nb"].copy())
+    return np.concatenate(kept), np.concatenate(velocities), np.concatenate(attitudes)
+
+
+def _matrices(q_nb: Array) -> Array:
+    """Return attitudes as matrices."""
+    return np.asarray(Attitude.from_quat(np.roll(q_nb, -1, axis=-1)).as_matrix(), np.float64)

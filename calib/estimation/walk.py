@@ -1,11 +1,12 @@
 """Random walk of the sum of a sensor's increments at rest."""
 
 from collections.abc import Iterable
+from math import sqrt
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from calib.estimation.pulses import passages
+from calib.estimation.channel import Channel, channel, spaced
 from imudrv.arrays import Array
 
 STEP_S: Final = 1.0
@@ -18,12 +19,17 @@ class WalkEstimate(NamedTuple):
     squares: float  # rad^2/s or (m/s)^2/s, less what the readings' own errors contribute
     degrees_of_freedom: int
 
+    @property
+    def root(self) -> float:
+        """The random walk, rad/sqrt(s) or m/s/sqrt(s); 0: unknown."""
+        return sqrt(max(self.squares, 0.0) / self.degrees_of_freedom) if self.degrees_of_freedom else 0.0
+
 
 def random_walk(t_s: Array, increments: Array, pulse: Array, channels: Iterable[int]) -> WalkEstimate:
     """Estimate the random walk of some channels at rest.
 
-    At rest the sum of the increments is `f t` plus the random walk. For readings at least `STEP_S` apart, at
-    the first pulse after that time,
+    At rest the sum of the increments is `f t` plus the random walk. For readings at least `STEP_S` apart, and
+    at least the time between two pulses: one that comes back to the edge of a pulse says nothing,
 
         sum of (dv - f dt)^2 / dt = (n - 1) q^2 + 2 s^2 sum of 1 / dt
 
@@ -46,23 +52,21 @@ def random_walk(t_s: Array, increments: Array, pulse: Array, channels: Iterable[
     """
     squares, freedom = 0.0, 0
     for i in channels:
-        at, variance = passages(increments[:, i], float(pulse[i]))
         total = np.cumsum(increments[:, i])
-        t, v = 0.5 * (t_s[at] + t_s[at - 1]), 0.5 * (total[at] + total[at - 1])
-        chosen = _spaced(t)
-        if len(chosen) < 3:
-            continue
-        dt, dv = np.diff(t[chosen]), np.diff(v[chosen])
-        residual = dv - dv.sum() / dt.sum() * dt
-        squares += float((residual**2 / dt).sum() - 2.0 * variance * (1.0 / dt).sum())
-        freedom += len(dt) - 1
+        # the walk decides how a channel is read; for that a first estimate is good enough
+        a_pulse_s = float(pulse[i]) * (t_s[-1] - t_s[0]) / max(abs(float(total[-1])), 1e-12)
+        walk = _of(channel(t_s, total, increments[:, i], float(pulse[i]), 0.0), a_pulse_s).root
+        more, n = _of(channel(t_s, total, increments[:, i], float(pulse[i]), walk), a_pulse_s)
+        squares, freedom = squares + more, freedom + n
     return WalkEstimate(squares, freedom)
 
 
-def _spaced(t: Array) -> list[int]:
-    """Return the first of some times, and each first one at least `STEP_S` after the one before."""
-    chosen, after = [], 0
-    while after < len(t):
-        chosen.append(after)
-        after = int(np.searchsorted(t, t[after] + STEP_S))
-    return chosen
+def _of(read: Channel, step_s: float) -> WalkEstimate:
+    """Return the estimate of one channel."""
+    chosen = spaced(read.t_s, max(STEP_S, step_s))
+    if len(chosen) < 3:
+        return WalkEstimate(0.0, 0)
+    dt, dv = np.diff(read.t_s[chosen]), np.diff(read.v[chosen])
+    residual = dv - dv.sum() / dt.sum() * dt
+    own = 2.0 * read.variance[0] * (1.0 / dt).sum()
+    return WalkEstimate(float((residual**2 / dt).sum() - own), len(dt) - 1)
