@@ -1,6 +1,6 @@
 """Verdict on a calibration of the sensors: the sentences, each with its mark."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from math import degrees
 from typing import Final
 
@@ -31,10 +31,11 @@ def judge(
 ) -> Iterator[Judgement]:
     """Yield the sentences on an adjustment that converged."""
     lacking = [one.path for one in estimates if not one.observable]
-    known = sum(one.observable for one in estimates)
+    shown = [one for one in estimates if one.is_shown]
+    known = sum(one.observable for one in shown)
     yield Judgement(
         "good",
-        f"{len(evidence.rests)} rests and {len(evidence.links)} motions; {known} of {len(estimates)} numbers "
+        f"{len(evidence.rests)} rests and {len(evidence.links)} motions; {known} of {len(shown)} numbers "
         "are observable.",
     )
     reduced, freedom = adjustment.reduced, adjustment.degrees_of_freedom
@@ -56,7 +57,7 @@ def judge(
     yield from _scales(adjustment)
     if lacking:
         yield Judgement(
-            "note", f"Not observable, and kept at the start or left out: {', '.join(_short(lacking))}."
+            "note", f"Not observable, and kept at the start or left out: {', '.join(grouped(lacking))}."
         )
 
 
@@ -150,7 +151,7 @@ def earth_judgement(site: Site, earth: np.ndarray, sigmas: float) -> Judgement:
     )
 
 
-def _short(paths: list[str]) -> list[str]:
+def grouped(paths: Sequence[str]) -> list[str]:
     """Return paths, the three of one vector together."""
     groups: dict[str, list[str]] = {}
     for path in paths:
