@@ -4,6 +4,7 @@ The report is a function of the result: it computes only means, extremes and oth
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import chain
 from math import hypot
@@ -54,6 +55,28 @@ def document(identification: IdentificationResult, arms: Sequence[LeverArms]) ->
             Section("Limits", tuple(Paragraph(text) for text in _limits(identification, arms[0]))),
         ),
     )
+
+
+def terminal_document(
+    identification: IdentificationResult, arms: Sequence[LeverArms], verbose: bool = False
+) -> Document:
+    """Return the result with the verdict at the end, as text that scrolls away is read.
+
+    Parameters
+    ----------
+    identification, arms
+        As for `document`.
+    verbose : bool
+        The other sections precede the result.
+
+    Returns
+    -------
+    Document
+    """
+    whole = document(identification, arms)
+    result, *others = whole.sections
+    marks, *tables = result.blocks
+    return replace(whole, sections=(*(others if verbose else ()), Section(result.title, (*tables, marks))))
 
 
 def report_html(identification: IdentificationResult, arms: Sequence[LeverArms]) -> str:

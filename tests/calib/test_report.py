@@ -15,7 +15,7 @@ from calib.estimation.result import ChiSquare, LeaveOneOut
 from calib.identification import IdentificationResult, PriorCalibration, identify
 from calib.lever_arms.gauge import LeverArms, convert
 from calib.messages import english
-from calib.reports.identification import arms_text, document, report_html
+from calib.reports.identification import arms_text, document, report_html, terminal_document
 from calib.reports.text import as_text
 from calib.reports.verdict import verdict
 from imudrv.cli import main as imudrv
@@ -123,6 +123,18 @@ def test_text_from_files_is_escaped(
     assert "50&lt;b&gt;&amp;17" in page
     assert "\x1b" not in page
     assert "\x1b" not in as_text(document(identification, arms))
+
+
+def test_on_a_terminal_the_verdict_is_last_and_the_rest_only_on_request(
+    identification: IdentificationResult, arms: tuple[LeverArms, LeverArms]
+) -> None:
+    short = as_text(terminal_document(identification, arms))
+    last = short.rstrip().splitlines()[-8:]
+    assert any(line.strip().startswith("good") for line in last)
+    assert len(short.splitlines()) < 45  # a screen, of the 258 lines of the whole
+    whole = as_text(terminal_document(identification, arms, verbose=True))
+    assert whole.index("THE ESTIMATE") < whole.index("RESULT")
+    assert whole.rstrip().splitlines()[-8:] == last
 
 
 def test_the_text_fits_80_columns_whatever_the_names(
