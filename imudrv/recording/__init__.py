@@ -4,6 +4,7 @@ format    channels and their encoding
 reader    read a recording, also one that was cut
 pack      compress one
 export    convert to other formats
+samples   increments to export, counted
 waypoint  export to Waypoint and Inertial Explorer
 ros2      export to ROS 2
 """
