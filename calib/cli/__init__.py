@@ -16,6 +16,10 @@ COMMANDS: Final = {
     ),
     "key": "Make or show the key with which this bench signs its sessions and certificates.",
     "identify": "Identify lever arms from captures of rotations: certificate and report.",
+    "noise": (
+        "Compute the noise of a unit from a long rest: Allan deviations and their coefficients; "
+        "exit code 3 if it was not at rest."
+    ),
     "align": "Align a rest: level, heading, and its readings against the site; exit code 3 if it moved.",
     "validate": "Navigate the same pulses with and without compensation; exit code 3 if a verdict is bad.",
     "gauge": "Convert the lever arms of a certificate to another gauge, exactly, with their covariance.",
