@@ -17,7 +17,7 @@ from imudrv.files.model import Matrix3, Model, UtcTime
 from imudrv.files.settings_file import SettingsFile, read_file, write
 from imudrv.imu.coefficients import Coefficients, TemperatureTerms
 from imudrv.sensor_calibration import Noise, SensorsProvenance, number_paths
-from imudrv.units import ARCSEC, DEG_PER_H, MM, PPM, UG
+from imudrv.units import ARCSEC, DEG_PER_H, MM, MS, PPM, STANDARD_GRAVITY, UG
 
 NORM_TOLERANCE: Final = 0.1
 """Largest deviation from 1 of the length of a row or column of an axes matrix."""
@@ -27,6 +27,8 @@ GAUGE_TOLERANCE_MM: Final = 1e-5
 """Largest deviation from the stated gauge: ten times the rounding to six decimals."""
 COVARIANCE_TOLERANCE_MM2: Final = 5e-6
 """Largest asymmetry and negative eigenvalue of a covariance: nine entries, each rounded to six decimals."""
+_NONE: Final = (0.0, 0.0, 0.0)
+
 MAX_PROVENANCE: Final = 1 << 18
 """Largest provenance, characters of JSON."""
 PROVENANCE_SENSORS: Final = "sensors"
@@ -399,13 +401,7 @@ def coefficients(calibration: Calibration) -> Coefficients:
     -------
     Coefficients
         SI.
-
-    Raises
-    ------
-    InputError
-        The calibration has terms that this version does not compensate.
     """
-    _require_compensable(calibration)
     gyro, accelerometer, terms = calibration.gyro, calibration.accelerometer, calibration.temperature
     return Coefficients(
         gyro_scale=_array(gyro.scale_arcsec_per_pulse or gyro.scale, ARCSEC if gyro.scale is None else 1.0),
@@ -425,21 +421,9 @@ def coefficients(calibration: Calibration) -> Coefficients:
         )
         if terms
         else None,
+        quadratic=_array(accelerometer.quadratic_ug_per_g2 or _NONE, UG / STANDARD_GRAVITY**2),
+        asymmetry=_array(accelerometer.asymmetry_ppm or _NONE, PPM),
+        skew_s=(calibration.skew_ms or 0.0) * MS,
         gyro_in_pulses=gyro.scale is None,
         accelerometer_in_pulses=accelerometer.scale is None,
     )
-
-
-def _require_compensable(calibration: Calibration) -> None:
-    """Refuse terms that would be left in the increments without a word."""
-    accelerometer = calibration.accelerometer
-    terms = {
-        "accelerometer.quadratic_ug_per_g2": accelerometer.quadratic_ug_per_g2 or (),
-        "accelerometer.asymmetry_ppm": accelerometer.asymmetry_ppm or (),
-        "skew_ms": (calibration.skew_ms or 0.0,),
-    }
-    if left := [name for name, values in terms.items() if any(values)]:
-        raise InputError(
-            f"calibration of unit {calibration.serial_number!r}: expected no {' or '.join(left)}, which this "
-            "version does not compensate, got one; use a version that does, or a certificate without"
-        )

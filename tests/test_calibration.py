@@ -427,14 +427,14 @@ def test_a_fault_in_the_keys_of_the_sensors_is_named(document: dict[str, Any], w
     assert words in fault(document)
 
 
-@pytest.mark.parametrize(
-    "path", ["skew_ms", "accelerometer.quadratic_ug_per_g2", "accelerometer.asymmetry_ppm"]
-)
-def test_terms_that_are_not_compensated_yet_are_refused_where_increments_are_made(path: str) -> None:
-    size = 0.3 if path == "skew_ms" else [1.0, 0.0, 0.0]
-    with pytest.raises(InputError, match=f"50-0017.*expected no {path}, which this version does not comp"):
-        coefficients(calibration(changed(path, size)))
-    coefficients(calibration(changed(path, 0.0 if path == "skew_ms" else [0.0, 0.0, 0.0])))
+def test_the_terms_of_the_sensors_are_compensated_in_si() -> None:
+    terms = changed("accelerometer.quadratic_ug_per_g2", [10.0, 0.0, -20.0])
+    terms["accelerometer"]["asymmetry_ppm"], terms["skew_ms"] = [0.0, 5.0, 0.0], 0.3
+    c = coefficients(calibration(terms))
+    g = 9.80665  # 10 ug/g^2: at 1 g 10 ug
+    np.testing.assert_allclose(c.quadratic * g**2, np.array([10e-6, 0.0, -20e-6]) * g, rtol=1e-12)
+    np.testing.assert_allclose(c.asymmetry, [0.0, 5e-6, 0.0], rtol=1e-12)
+    assert c.skew_s == pytest.approx(3e-4, rel=1e-12)
 
 
 def test_identification_begins_without_the_skew_that_it_estimates() -> None:

@@ -15,6 +15,10 @@ COMMANDS: Final = {
         "exit code 2 damaged, 3 unfinished, 4 not signed by a trusted key."
     ),
     "key": "Make or show the key with which this bench signs its sessions and certificates.",
+    "sensors": (
+        "Calibrate the sensors of a unit from rests in several poses and the motions between them; exit "
+        "code 3 if the verdict is bad."
+    ),
     "identify": "Identify lever arms from captures of rotations: certificate and report.",
     "noise": (
         "Compute the noise of a unit from a long rest: Allan deviations and their coefficients; "

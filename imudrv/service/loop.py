@@ -28,6 +28,7 @@ from imudrv.calibration import coefficients
 from imudrv.chain import Chain, Output
 from imudrv.diagnosis import LineState
 from imudrv.hostclock import now_ns
+from imudrv.imu.compensation import LEAVES_OUT_SKEW
 from imudrv.ports import PortEndedError
 from imudrv.records import INCREMENTS, PULSES, Arrival, Source
 from imudrv.service.calibration_watch import CalibrationWatch
@@ -176,6 +177,8 @@ class Service:
                 self._manager.notify("READY=1")
                 sha256 = self._calibration.current.sha256
                 self._events.event(f"serving {self._settings.port}, calibration {sha256[:12]}")
+                if self._chain.leaves_out_skew:
+                    self._events.event(LEAVES_OUT_SKEW)
                 while not self._signals.stop and self.step():
                     pass
             finally:

@@ -255,7 +255,7 @@ class Unit(Model):
     calibration is that of a unit whose lever arms are still to be found. Residuals make the unit differ from
     its calibration; `seed` draws them, by default that of the scenario: scenarios with the same `seed` here
     and different ones there are of one unit. The sample interval of the accelerometers ends
-    `accelerometer_skew_s` later than that of the gyros.
+    `accelerometer_skew_s` later than that of the gyros, beside the skew in the calibration.
     """
 
     calibration_file: Annotated[str, Key(min_length=1, max_length=4096)] | None = None

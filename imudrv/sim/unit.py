@@ -4,7 +4,10 @@ The true unit is a calibration, with the conventions of the file inverted, that 
 from the one that will compensate it:
 
     gyro axes            N_g = C_bg^-1 (dtheta_b + b_g tau) / k_g
-    accelerometer i      N_i = K_i (integral of f_i + b_i tau)
+    accelerometer i      N_i = K_i (e_i + b_i tau)
+
+where `e_i - q_i e_i^2 / tau - asymmetry_i |e_i| / 2` is the integral of f_i, over an interval that ends later
+by the skew,
 
 with `k_g`, `K`, `b_g`, `b` each at the temperature of the sample: the scale in the file times
 `1 + ppm_per_k (T - T_reference)`, the bias plus `bias_per_k (T - T_reference)`. `N` are pulses, or rad and
@@ -93,6 +96,8 @@ class _Electronics(NamedTuple):
     accelerometer_bias: Array
     accelerometer_bias_per_k: Array
     accelerometer_scale_per_k: Array
+    quadratic: Array  # s^2/m
+    half_asymmetry: Array
     accelerometer_noise: float  # m/s
     counts: _Counts
     step_at_s: Array  # (m,), when biases change
@@ -179,7 +184,7 @@ def simulate(scenario: Scenario, layout: Layout, chunk: int = 65_536) -> Iterato
     truth = draw_true_unit(scenario, layout)
     rng = _generator(scenario.seed, 3)
     # With a skew, an accelerometer sample is the late part of one interval and the early part of a later one.
-    skew, split_ns = divmod(round(scenario.unit.accelerometer_skew_s / NS), interval)
+    skew, split_ns = divmod(round((truth.skew_s + scenario.unit.accelerometer_skew_s) / NS), interval)
     motion = Motion(scenario, _body(scenario, truth, interval_s), split_ns * NS)
     electronics = _electronics(scenario, truth, layout)
     start = scenario.start.counter if layout.sequence.kind is SequenceKind.COUNTER else 0
@@ -364,6 +369,8 @@ def _electronics(scenario: Scenario, truth: Coefficients, layout: Layout) -> _El
         accelerometer_bias=truth.accelerometer_bias,
         accelerometer_bias_per_k=terms.accelerometer_bias,
         accelerometer_scale_per_k=terms.accelerometer_scale,
+        quadratic=truth.quadratic,
+        half_asymmetry=0.5 * truth.asymmetry,
         accelerometer_noise=unit.noise.vrw_m_s_per_sqrt_h * PER_SQRT_H * interval_s**0.5,
         counts=_counts(layout, unit.saturation),
         step_at_s=step_at_s,
@@ -432,11 +439,21 @@ def _count(
             bias = (
                 unit.accelerometer_bias[m] + warmer * unit.accelerometer_bias_per_k[m] + accelerometer_step[m]
             )
-            speed = velocity[i, m] + tau * bias + unit.accelerometer_noise * noise[i, 3 + m]
+            speed = _input(unit, m, velocity[i, m]) + tau * bias + unit.accelerometer_noise * noise[i, 3 + m]
             scale = unit.accelerometer_scale[m] * (1.0 + warmer * unit.accelerometer_scale_per_k[m])
             increments[i, 3 + m], is_over = _sent(speed * scale, unit.counts, carry, 3 + m)
             overflow[i] |= is_over
         before = angle_now
+
+
+@kernel
+def _input(unit: _Electronics, axis: int, velocity: float) -> float:
+    """Return what an accelerometer that is not linear makes of a velocity: two steps of a fixed point."""
+    speed = velocity
+    for _ in range(2):  # to 1e-6 of the term, itself below 1e-3
+        curve = unit.quadratic[axis] * speed * speed / unit.interval_s
+        speed = velocity + curve + unit.half_asymmetry[axis] * abs(speed)
+    return speed
 
 
 @kernel

@@ -1,0 +1,563 @@
+"""Rests of a capture and the samples of the motions between them.
+
+Three passes over the pulses: where the unit rests; the rests, in bins of a second; the motions. A count at
+the edge of a rest is the mean over a bin of (count - rate t), which the pulse hardly shows in. The same
+counts begin and end the motions, so that their errors are shared.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from math import pi, sqrt
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.detection.segments import Segmenter
+from calib.sensors.motion import SAMPLE
+from calib.sensors.parameters import NominalScales
+from imudrv.arrays import Array
+from imudrv.errors import InputError
+from imudrv.imu.coefficients import Coefficients
+from imudrv.imu.compensation import Compensator
+from imudrv.records import Flag, Records
+from imudrv.units import ARCSEC, NS, STANDARD_GRAVITY, UG
+from imudrv.wire.layout import Layout
+
+GUARD_S: Final = 1.0
+"""Time at both ends of a rest that counts as motion: the unit settles, s."""
+LEAST_REST_S: Final = 20.0
+"""Shortest rest that is used, s."""
+LONGEST_MOTION_S: Final = 900.0
+"""Longest motion that links two rests, s."""
+BIN_S: Final = 1.0
+"""Averaging time of a count at an edge, s."""
+DRIFT_SIGMAS: Final = 5.0
+DRIFT_FLOOR: Final = 1.5 * UG
+"""A rest moves if its force changes by more than this many sigma; the floor allows for wander, m/s^2."""
+
+BAD_FLAGS: Final = int(Flag.SATURATED | Flag.FAULT)
+GAP_FLAGS: Final = int(Flag.MISSING_BEFORE | Flag.LONG_INTERVAL)
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Random walks of a unit's gyros and accelerometers, each axis: rad/sqrt(s), m/s/sqrt(s)."""
+
+    angle_walk: float
+    velocity_walk: float
+
+
+@dataclass(frozen=True)
+class RestBins:
+    """A rest: sums of its increments at nominal scale over bins of a second.
+
+    Attributes
+    ----------
+    session : int
+        Number of the capture.
+    start, stop : int
+        Counter of the first sample, and of the first after the last.
+    start_s : float
+        Time from the beginning of the capture.
+    bin_s : float
+        Length of a bin.
+    samples : int
+        Samples of a bin.
+    sums : ndarray, shape (n, 6)
+        Increments of gyros and accelerometers X Y Z over each bin, rad, m/s.
+    means : ndarray, shape (n, 6)
+        Mean over each bin of the sum since its beginning.
+    degc : ndarray, shape (4,)
+        Mean temperature of the gyros and of each accelerometer; NaN: not measured.
+    span_k : float
+        Largest change of any of these from bin to bin of the rest.
+    """
+
+    session: int
+    start: int
+    stop: int
+    start_s: float
+    bin_s: float
+    samples: int
+    sums: Array
+    means: Array
+    degc: Array
+    span_k: float = 0.0
+
+    @property
+    def duration_s(self) -> float:
+        """Length, s."""
+        return len(self.sums) * self.bin_s
+
+    @property
+    def stop_s(self) -> float:
+        """Time of the end from the beginning of the capture."""
+        return self.start_s + self.duration_s
+
+    @property
+    def rate(self) -> Array:
+        """Mean rates and forces at nominal scale, shape (6,), rad/s and m/s^2."""
+        return _rate(self.sums, self.means, self.bin_s)
+
+    @property
+    def edges(self) -> Array:
+        """Smoothed less actual sum at the begin and at the end of the rest, shape (2, 6)."""
+        early, late = 0.5 * (self.samples + 1), 0.5 * (self.samples - 1)
+        step = self.rate * self.bin_s / self.samples
+        before = self.means[0] - early * step
+        after = self.means[-1] - self.sums[-1] + late * step
+        return np.stack([before, after])
+
+    def drift(self, noise: Noise, quantum: float) -> tuple[float, float]:
+        """Return the change of the force from the first to the last quarter, m/s^2, and its sigma."""
+        n = max(2, len(self.sums) // 4)
+        change = _rate(self.sums[-n:], self.means[-n:], self.bin_s) - _rate(
+            self.sums[:n], self.means[:n], self.bin_s
+        )
+        seconds = (n - 1) * self.bin_s
+        variance = noise.velocity_walk**2 / seconds + 2.0 * (0.3 * quantum / seconds) ** 2
+        return float(np.linalg.norm(change[3:])), sqrt(2.0 * variance)
+
+
+def _rate(sums: Array, means: Array, bin_s: float) -> Array:
+    """Return the rate between the mean counts of the first and the last bin."""
+    late = sums[:-1].sum(axis=0) + means[-1]
+    rate: Array = (late - means[0]) / ((len(sums) - 1) * bin_s)
+    return rate
+
+
+@dataclass(frozen=True)
+class Left:
+    """A rest or a motion that is not used as one.
+
+    Attributes
+    ----------
+    start_s, stop_s : float
+        Time from the beginning of the capture.
+    what : str
+        'rest' or 'motion'.
+    reason : str
+        Why, in words.
+    """
+
+    session: int
+    start_s: float
+    stop_s: float
+    what: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Link:
+    """The samples between two rests that follow each other in one capture.
+
+    Attributes
+    ----------
+    before, after : int
+        Numbers of the rests.
+    samples : ndarray of SAMPLE
+        With the counts of the edges in them.
+    """
+
+    before: int
+    after: int
+    samples: Records = field(repr=False)
+
+    @property
+    def duration_s(self) -> float:
+        """Length, s."""
+        return float(self.samples["T"].sum())
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Everything that captures say: rests, motions, and what was left out.
+
+    Attributes
+    ----------
+    rests : tuple of RestBins
+        In order, capture by capture.
+    links : tuple of Link
+    left : tuple of Left
+    noise : Noise
+    quanta : tuple of float
+        Pulse of a gyro, rad, and of an accelerometer, m/s.
+    fastest : float
+        Largest rate of any gyro in a motion, rad/s.
+    """
+
+    rests: tuple[RestBins, ...]
+    links: tuple[Link, ...]
+    left: tuple[Left, ...]
+    noise: Noise
+    quanta: tuple[float, float]
+    fastest: float = 0.0
+
+
+def read_evidence(
+    captures: Sequence[Callable[[], Iterable[Records]]],
+    layout: Layout,
+    nominal: NominalScales,
+) -> Evidence:
+    """Read rests and motions.
+
+    Parameters
+    ----------
+    captures : sequence of callable
+        Each gives the pulses of a capture from its beginning, three times.
+    layout : Layout
+        Layout of the profile.
+    nominal : NominalScales
+
+    Returns
+    -------
+    Evidence
+
+    Raises
+    ------
+    InputError
+        A capture is too short, or there are fewer than three rests.
+    """
+    quanta = (
+        nominal.gyro if nominal.gyro_in_pulses else 0.0,
+        1.0 / nominal.accelerometer if nominal.accelerometer_in_pulses else 0.0,
+    )
+    found: list[RestBins] = []
+    left: list[Left] = []
+    for session, pulses in enumerate(captures):
+        windows, short = _windows(session, pulses(), layout, nominal)
+        left += short
+        rests, dropped = _bins(session, pulses(), windows, layout, nominal)
+        found += rests
+        left += dropped
+    if len(found) < LEAST_RESTS:
+        raise InputError(too_few_text(found, left))
+    noise = rest_noise(found)
+    still = []
+    for rest in found:
+        change, sigma = rest.drift(noise, quanta[1])
+        if change > DRIFT_SIGMAS * sqrt(sigma**2 + DRIFT_FLOOR**2):
+            moved = change / STANDARD_GRAVITY / ARCSEC
+            reason = (
+                f"its force changed by {change / UG:.0f} ug, as by a tilt of {moved:.0f} arcsec: no "
+                "rest, a part of the motion"
+            )
+            left.append(Left(rest.session, rest.start_s, rest.stop_s, "rest", reason))
+        else:
+            still.append(rest)
+    if len(still) < LEAST_RESTS:
+        raise InputError(too_few_text(still, left))
+    noise = rest_noise(still)
+    links: list[Link] = []
+    fastest = 0.0
+    for session, pulses in enumerate(captures):
+        numbers = [k for k, rest in enumerate(still) if rest.session == session]
+        for item in _links(pulses(), [(k, still[k]) for k in numbers], layout, nominal):
+            if isinstance(item, Link):
+                links.append(item)
+                fastest = max(fastest, float(np.abs(item.samples["gyro"] / item.samples["T"][:, None]).max()))
+            else:
+                left.append(item)
+    ordered = tuple(sorted(left, key=lambda one: (one.session, one.start_s)))
+    return Evidence(tuple(still), tuple(links), ordered, noise, quanta, fastest)
+
+
+LEAST_RESTS: Final = 3
+"""Fewest rests that are solved."""
+
+
+def too_few_text(rests: Sequence[RestBins], left: Sequence[Left]) -> str:
+    """Return the message for too few rests."""
+    lines = [
+        f"expected at least {LEAST_RESTS} rests of {LEAST_REST_S:g} s in different poses, got {len(rests)}"
+    ]
+    lines += [f"{one.what} at {one.start_s:.1f} to {one.stop_s:.1f} s: {one.reason}" for one in left]
+    return "\n  ".join(lines)
+
+
+@dataclass(frozen=True)
+class _Window:
+    start: int
+    stop: int
+    start_s: float
+
+
+def _windows(
+    session: int, pulses: Iterable[Records], layout: Layout, nominal: NominalScales
+) -> tuple[list[_Window], list[Left]]:
+    """Find the rests, without a guard at both ends."""
+    compensator = Compensator(_coefficients(nominal), layout)
+    segmenter = Segmenter()
+    for piece in pulses:
+        segmenter.feed(compensator.feed(piece))
+    segmenter.feed(compensator.close())
+    segments = segmenter.result()
+    windows, left = [], []
+    guard = round(GUARD_S / segments.interval_s)
+    for rest in segments.rests:
+        if rest.duration_s < LEAST_REST_S:
+            reason = f"it lasts {rest.duration_s:.1f} s, less than {LEAST_REST_S:g} s: a part of the motion"
+            left.append(Left(session, rest.start_s, rest.stop_s, "rest", reason))
+        else:
+            at_s = rest.start_s + guard * segments.interval_s
+            windows.append(_Window(rest.start + guard, rest.stop - guard, at_s))
+    return windows, left
+
+
+def _coefficients(nominal: NominalScales) -> Coefficients:
+    zero, ones = np.zeros(3), np.ones(3)
+    return Coefficients(
+        gyro_scale=nominal.gyro * ones,
+        gyro_bias=zero,
+        C_bg=np.eye(3),
+        accelerometer_scale=nominal.accelerometer * ones,
+        accelerometer_bias=zero,
+        C_ba=np.eye(3),
+        gyro_in_pulses=nominal.gyro_in_pulses,
+        accelerometer_in_pulses=nominal.accelerometer_in_pulses,
+    )
+
+
+class _Binner:
+    """Bins of a rest, piece by piece; a loss or a bad sample begins a new run of bins."""
+
+    def __init__(self, samples: int) -> None:
+        self._samples = samples
+        self._weights = (samples - np.arange(samples)) / samples
+        self.runs: list[tuple[int, list[Array], list[Array], list[Array]]] = []
+        self.bad = 0
+        self.gaps = 0
+        self._rest: Array = np.zeros((0, 10))
+
+    def feed(self, rows: Array, counters: Array, breaks: NDArray[np.int64]) -> None:
+        """Process samples: increments (6) and temperatures (4); `breaks` are the rows that follow a loss."""
+        for k, part in enumerate(np.split(np.arange(len(rows)), breaks)):
+            if (k or not self.runs) and len(part):
+                self.runs.append((int(counters[part[0]]), [], [], []))
+                self._rest = rows[:0]
+            if len(part):
+                self._add(rows[part])
+
+    def _add(self, rows: Array) -> None:
+        rows = np.concatenate([self._rest, rows])
+        n = len(rows) // self._samples
+        bins = rows[: n * self._samples].reshape(n, self._samples, 10)
+        self._rest = rows[n * self._samples :]
+        if n:
+            _, sums, means, degc = self.runs[-1]
+            sums.append(bins[:, :, :6].sum(axis=1))
+            means.append(np.tensordot(bins[:, :, :6], self._weights, (1, 0)))
+            degc.append(bins[:, :, 6:].mean(axis=1))
+
+
+def _bins(
+    session: int,
+    pulses: Iterable[Records],
+    windows: Sequence[_Window],
+    layout: Layout,
+    nominal: NominalScales,
+) -> tuple[list[RestBins], list[Left]]:
+    """Sum the rests into bins; of one with a loss the longest part counts."""
+    samples = max(2, round(BIN_S / (layout.interval_ns * NS)))
+    binners = [_Binner(samples) for _ in windows]
+    channels = _temperature_columns(layout)
+    for piece, counter in _counted(pulses, layout):
+        for window, binner in zip(windows, binners, strict=True):
+            a, b = np.searchsorted(counter, [window.start, window.stop])
+            if a == b:
+                continue
+            rows = piece[a:b]
+            flags = rows["flags"]
+            binner.bad += int(np.count_nonzero(flags & BAD_FLAGS))
+            lost = np.flatnonzero(flags & GAP_FLAGS)
+            binner.gaps += len(lost)
+            binner.feed(
+                np.concatenate([increments(rows, nominal), _degc(rows, channels)], axis=1), counter[a:b], lost
+            )
+    rests, left = [], []
+    for window, binner in zip(windows, binners, strict=True):
+        usable = [run for run in binner.runs if run[1]]
+        stop_s = window.start_s + (window.stop - window.start) * samples_s(layout)
+        if binner.bad:
+            reason = f"{binner.bad} samples are saturated or faulted: not used"
+            left.append(Left(session, window.start_s, stop_s, "rest", reason))
+            continue
+        if not usable:
+            left.append(
+                Left(session, window.start_s, stop_s, "rest", "it has no second without a loss: not used")
+            )
+            continue
+        first, sums, means, degc = max(usable, key=lambda run: sum(map(len, run[1])))
+        bins, temperatures = np.concatenate(sums), np.concatenate(degc)
+        duration_s = len(bins) * samples * samples_s(layout)
+        start_s = window.start_s + (first - window.start) * samples_s(layout)
+        if len(bins) < 4 or (binner.gaps and duration_s < LEAST_REST_S - 2.0 * GUARD_S):
+            reason = f"frames are lost, and its longest part lasts {duration_s:.1f} s: a part of the motion"
+            left.append(Left(session, window.start_s, stop_s, "rest", reason))
+            continue
+        if binner.gaps:
+            stop = start_s + duration_s
+            reason = f"frames are lost: its longer part, {start_s:.1f} to {stop:.1f} s, is the rest"
+            left.append(Left(session, window.start_s, stop_s, "part of a rest", reason))
+        known = np.isfinite(temperatures).all(axis=0)
+        span = float(np.ptp(temperatures[:, known], axis=0).max()) if known.any() else 0.0
+        rests.append(
+            RestBins(
+                session,
+                first,
+                first + len(bins) * samples,
+                start_s,
+                samples * samples_s(layout),
+                samples,
+                bins,
+                np.concatenate(means),
+                temperatures.mean(axis=0),
+                span,
+            )
+        )
+    return rests, left
+
+
+def samples_s(layout: Layout) -> float:
+    """Return the sample interval, s."""
+    return float(layout.interval) * NS
+
+
+def _counted(pulses: Iterable[Records], layout: Layout) -> Iterator[tuple[Records, Array]]:
+    """Yield pieces with their counters in samples, as the compensation numbers them."""
+    for piece in pulses:
+        if len(piece):
+            yield piece, piece["counter"] // layout.counter_step
+
+
+def increments(rows: Records, nominal: NominalScales) -> Array:
+    """Return increments at nominal scale, shape (n, 6), rad and m/s."""
+    return np.concatenate(
+        [rows["gyro"] * nominal.gyro, rows["accelerometer"] / nominal.accelerometer], axis=1
+    )
+
+
+def _temperature_columns(layout: Layout) -> list[int]:
+    """Return the channel of the gyros and of each accelerometer; -1: not measured."""
+    names = layout.temperature_names
+
+    def channel(*candidates: str) -> int:
+        return next((names.index(c) for c in candidates if c in names), -1)
+
+    return [channel("gyro"), *(channel(f"accelerometer_{axis}", "accelerometer") for axis in "xyz")]
+
+
+def _degc(rows: Records, channels: Sequence[int]) -> Array:
+    degc = np.full((len(rows), 4), np.nan)
+    for k, channel in enumerate(channels):
+        if channel >= 0:
+            degc[:, k] = rows["temperature_degc"][:, channel]
+    return degc
+
+
+def _links(
+    pulses: Iterable[Records], rests: Sequence[tuple[int, RestBins]], layout: Layout, nominal: NominalScales
+) -> Iterator[Link | Left]:
+    """Yield the motions between rests that follow each other, or why one links nothing."""
+    spans = [_Span(k, j, before, after) for (k, before), (j, after) in pairwise(rests)]
+    for piece, counter in _counted(pulses, layout):
+        for span in spans:
+            span.feed(piece, counter, nominal)
+    for span in spans:
+        yield span.result()
+
+
+class _Span:
+    """Samples between two rests."""
+
+    def __init__(self, k: int, j: int, before: RestBins, after: RestBins) -> None:
+        self._numbers = k, j
+        self._before, self._after = before, after
+        self._parts: list[Records] = []
+        self._lost = self._bad = 0
+        self._too_long = after.start_s - before.stop_s > LONGEST_MOTION_S
+
+    def feed(self, piece: Records, counter: Array, nominal: NominalScales) -> None:
+        """Take the samples of the span."""
+        a, b = np.searchsorted(counter, [self._before.stop, self._after.start])
+        if b < len(counter) and counter[b] == self._after.start and piece["flags"][b] & GAP_FLAGS:
+            self._lost += 1  # right before the rest
+        if a == b:
+            return
+        rows = piece[a:b]
+        self._lost += int(np.count_nonzero(rows["flags"] & GAP_FLAGS))
+        self._bad += int(np.count_nonzero(rows["flags"] & BAD_FLAGS))
+        if self._lost or self._bad or self._too_long:
+            self._parts.clear()
+            return
+        part = np.zeros(len(rows), SAMPLE)
+        part["T"] = rows["interval_ns"] * NS
+        both = increments(rows, nominal)
+        part["gyro"], part["accelerometer"] = both[:, :3], both[:, 3:]
+        self._parts.append(part)
+
+    def result(self) -> Link | Left:
+        """Return the link, the smoothed counts of its edges in it."""
+        before, after = self._before, self._after
+        reason = ""
+        if self._lost:
+            reason = "frames are lost in it"
+        elif self._bad:
+            reason = f"{self._bad} samples are saturated or faulted"
+        elif self._too_long:
+            reason = f"it lasts longer than {LONGEST_MOTION_S:g} s"
+        elif not self._parts:
+            reason = "it has no samples"
+        if reason:
+            text = f"{reason}: attitude and velocity are not carried over it"
+            return Left(before.session, before.stop_s, after.start_s, "motion", text)
+        samples = np.concatenate(self._parts)
+        for at, change in ((0, -before.edges[1]), (-1, after.edges[0])):
+            samples["gyro"][at] += change[:3]
+            samples["accelerometer"][at] += change[3:]
+        return Link(*self._numbers, samples)
+
+
+def rest_noise(rests: Sequence[RestBins]) -> Noise:
+    """Return the random walks, from the second differences of the mean counts of the bins.
+
+    With white noise s of a mean count and a random walk q the variance of a second difference over m bins is
+    `6 s^2 + q^2 (2 m - 1) T` for m >= 1 bins of length T: the difference of two lags is the walk's alone.
+    """
+    walks = []
+    for axes in (slice(0, 3), slice(3, 6)):
+        squares, counts = np.zeros(len(_LAGS)), np.zeros(len(_LAGS))
+        bin_s = rests[0].bin_s
+        for rest in rests:
+            counts_at = np.concatenate([np.zeros((1, 3)), np.cumsum(rest.sums[:-1, axes], axis=0)])
+            mean = counts_at + rest.means[:, axes]
+            for k, m in enumerate(_LAGS):
+                if len(mean) > 2 * m:
+                    second = mean[2 * m :] - 2.0 * mean[m:-m] + mean[: -2 * m]
+                    squares[k] += float((second**2).sum())
+                    counts[k] += second.size
+        usable = counts > 0
+        variance = squares[usable] / counts[usable]
+        lags = np.array(_LAGS)[usable]
+        if len(lags) < 2:
+            walks.append(0.0)
+            continue
+        walk = (variance[-1] - variance[0]) / (2.0 * (lags[-1] - lags[0]) * bin_s)
+        walks.append(sqrt(max(float(walk), 0.0)))
+    return Noise(*walks)
+
+
+_LAGS: Final = (1, 6)
+
+
+def edge_variance(pulses_per_bin: Array) -> Array:
+    """Return the variance of a mean count over a bin, in pulses squared, by the pulses that come in it.
+
+    The count is a sawtooth about (rate t); its mean over n periods has the variance
+    `sum of (1 / (pi k))^2 / 2 sinc^2(k n)`, here with the mean of sin^2 for a rate that is not known so well.
+    """
+    k = np.arange(1, 51)
+    passed = 1.0 / (1.0 + 2.0 * (pi * np.multiply.outer(np.abs(pulses_per_bin), k)) ** 2)
+    return np.asarray((passed * 0.5 / (pi * k) ** 2).sum(axis=-1), np.float64)
