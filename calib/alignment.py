@@ -100,7 +100,7 @@ class RestAlignment:
     @property
     def verdicts(self) -> tuple[tuple[str, str], ...]:
         """Mark and reason, the worst first."""
-        marks = [("bad", self.aligned.motion)] if self.aligned.motion else []
+        marks = [("bad", str(self.aligned.motion))] if self.aligned.motion else []
         for name, measured, of_site, sigma in (c for c in self.comparisons if not c.agrees):
             off = abs(measured - of_site) / sigma
             what_to_do = "check latitude, height and gravity of the site, and the calibration"

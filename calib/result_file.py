@@ -145,7 +145,12 @@ def _capture(source: CaptureSummary) -> dict[str, Any]:
         "temperature_degc": {t.channel: [t.least_degc, t.most_degc] for t in source.temperatures},
         "runs": [run.label for run in rotations.runs],
         "rejected": [
-            {"start_s": rotation.start_s, "stop_s": rotation.stop_s, "reasons": [*map(english, reasons)]}
+            {
+                "start_s": rotation.start_s,
+                "stop_s": rotation.stop_s,
+                "reasons": [*map(english, reasons)],
+                "messages": [*map(asdict, reasons)],
+            }
             for rotation, reasons in rotations.rejected
         ],
     }
@@ -192,7 +197,7 @@ def _profile(run: Run) -> dict[str, Any]:
             "heading_deg": aligned.heading_rad / DEG,
             "heading_sigma_deg": aligned.heading_sigma_rad / DEG,
             "level_sigma_arcsec": aligned.level_sigma_rad / ARCSEC,
-            "motion": aligned.motion,
+            "motion": None if aligned.motion is None else str(aligned.motion),
         },
     }
 
@@ -202,6 +207,7 @@ def _turn(turn: Turn) -> dict[str, Any]:
     return {
         "accepted": turn.accepted,
         "reasons": [*map(english, turn.reasons)],
+        "messages": [*map(asdict, turn.reasons)],
         "start_s": turn.start_s,
         "stop_s": turn.stop_s,
         "angle_deg": turn.angle_deg,

@@ -1,6 +1,8 @@
 """After the steps: result, the operator's decision, activation of the certificate, and report."""
 
-from calib.bench.entries import ResidualVelocity
+from typing import Final
+
+from calib.bench.entries import Decision
 from calib.bench.keys import Keyboard
 from calib.bench.queue_sink import QueueReader
 from calib.bench.result import Result, identify_session
@@ -9,11 +11,19 @@ from calib.bench.session import Session
 from calib.bench.state import REPORT, RESULT
 from calib.certificate import check_target, write
 from calib.lever_arms.gauge import convert
+from calib.messages import Message, english, message
 from calib.reports.identification import arms_text, report_html, verdict
 from imudrv.calibration import Calibration, read_calibration
 from imudrv.errors import InputError
 from imudrv.files import atomic, settings_file
 from imudrv.files.atomic import atomic_write
+
+_MARKS: Final = {
+    "good": message("mark_good"),
+    "note": message("mark_note"),
+    "caution": message("mark_caution"),
+    "bad": message("mark_bad"),
+}
 
 
 def session_result(session: Session) -> Result:
@@ -55,21 +65,20 @@ def ask_operator(unit: str, screen: OperatorScreen, keys: Keyboard, queue: Queue
     ServiceEndedError
         The service has ended before the answer.
     """
-    screen.print(f"Accept it as the certificate of unit {unit}? [y/n]")
+    screen.say(message("accept", unit=unit))
     while not screen.is_idle:
         queue.take()
     keys.read()  # keys pressed before the question are no answer to it
-    while True:
+    while (answer := keys.answer()) is None:
         queue.take()
-        for key in keys.read():
-            if key in "yn":
-                return key == "y"
+    return answer
 
 
-def summary(result: Result) -> str:
-    """Return the text on which the operator decides."""
-    verdicts = [f"{mark}: {text}" for mark, text in verdict(result.identification)]
-    return "\n".join([arms_text(result.identification.arms), *verdicts])
+def summarise(result: Result, screen: OperatorScreen) -> None:
+    """Print what the operator needs for the decision."""
+    screen.print(arms_text(result.identification.arms))
+    for mark, text in verdict(result.identification):
+        screen.say(message("mark", mark=_MARKS[mark], text=text))
 
 
 def activate(session: Session, certificate: Calibration) -> None:
@@ -99,13 +108,33 @@ def activate(session: Session, certificate: Calibration) -> None:
         )
 
 
-def write_report(session: Session, result: Result, residual: ResidualVelocity | None) -> None:
-    """Write the report, with the verification after the result, and record its hash."""
+def accepted_result(session: Session) -> tuple[Message, ...]:
+    """Return where the active certificate and the report are; empty if no result is accepted."""
+    decision = session.stage(Decision)
+    if decision is None or not decision.accepted:
+        return ()
+    return (
+        message("active_certificate", path=str(session.plan.certificate.path)),
+        message("report", path=str(session.folder / REPORT)),
+    )
+
+
+def write_report(session: Session, result: Result, verified: Message | None = None) -> None:
+    """Write the report and record its hash.
+
+    Parameters
+    ----------
+    session : Session
+        The session.
+    result : Result
+        Its result, accepted.
+    verified : Message, optional
+        Outcome of the verification; None: it is not done yet.
+    """
+    verified = message("verification_due") if verified is None else verified
     arms = result.identification.arms
     html = report_html(result.identification, (arms, convert(arms, "x")))
-    text = "The verification was skipped."
-    if residual is not None:
-        text = f"One more rotation with the new certificate: {residual}."
+    text = f"One more rotation with the new certificate: {english(verified)}."
     section = f"<section>\n<h2>Verification</h2>\n<p>{text}</p>\n</section>"
     with atomic_write(session.path(REPORT)) as file:
         file.write(html.replace("</section>", f"</section>\n{section}", 1).encode())

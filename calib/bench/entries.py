@@ -13,7 +13,7 @@ from typing import Annotated, Any, Final, Literal, Self, TypeAlias, get_args, ge
 from pydantic import AfterValidator, AwareDatetime, TypeAdapter, create_model
 from pydantic import Field as Key
 
-from calib.messages import verbatim
+from calib.messages import Message, message, verbatim
 from calib.procedure.events import (
     Aborted,
     Accepted,
@@ -204,11 +204,11 @@ class ResidualVelocity:
     without: float
     compensated: float
 
-    def __str__(self) -> str:
-        """Return a phrase for the operator."""
-        return (
-            f"residual velocity after half a turn: {self.without / MM:.1f} mm/s without size-effect "
-            f"compensation, {self.compensated / MM:.1f} mm/s with it"
+    @property
+    def message(self) -> Message:
+        """Phrase for the operator."""
+        return message(
+            "residual_velocity", without_mm_s=self.without / MM, compensated_mm_s=self.compensated / MM
         )
 
 

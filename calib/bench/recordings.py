@@ -10,6 +10,7 @@ from calib.bench.queue_sink import QueueReader, ServiceEndedError
 from calib.bench.result import uncovered
 from calib.bench.session import Session
 from calib.bench.state import Attempt
+from calib.messages import Message, message
 from calib.procedure.events import Accepted, NavigationLog
 from calib.procedure.schema import Step
 from imudrv.errors import InputError
@@ -72,7 +73,7 @@ class AttemptRecordings:
 
     def file(
         self, step: Step, accepted: Accepted, log: NavigationLog, degc: Mapping[str, float | None]
-    ) -> str:
+    ) -> Message | None:
         """End the recording of an accepted attempt, check it, and write the attempt to the journal.
 
         Parameters
@@ -88,8 +89,8 @@ class AttemptRecordings:
 
         Returns
         -------
-        str
-            Why the attempt cannot be accepted; empty if it is.
+        Message or None
+            Why the attempt cannot be accepted; None if it is.
         """
         session, name = self._session, self._current
         self.end()
@@ -99,11 +100,11 @@ class AttemptRecordings:
                 Attempt(step, path, accepted.first_counter, accepted.last_counter, accepted.samples)
             )
         except InputError as error:
-            return str(error)
+            return message("recording_unreadable", why=str(error))
         if missing:
-            return f"{missing}: this computer or its disk was too slow"
+            return message("recording_lacks", what=missing)
         with atomic_write(session.folder / f"{name}.npz") as archive:
             np.savez(archive, **{f.name: getattr(log, f.name) for f in fields(log)})
         session.record_file(f"{name}.npz")
         session.append(AcceptedStep(**vars(accepted), recording=path.name, temperature_degc=dict(degc)))
-        return ""
+        return None

@@ -12,11 +12,12 @@ from typing import Final
 
 from rich.console import Console
 
+from calib.bench.completion import accepted_result
 from calib.bench.controller import SessionController
 from calib.bench.entries import EmbeddedFile
 from calib.bench.keys import Keyboard
 from calib.bench.queue_sink import QueueSink
-from calib.bench.resume import check_files, require_same, resume
+from calib.bench.resume import check_files, require_same, resume, steps_message
 from calib.bench.screen import OperatorScreen
 from calib.bench.session import Session
 from calib.bench.simulated_unit import SimulatedUnitProcess, is_rehearsal
@@ -24,6 +25,7 @@ from calib.bench.state import JOURNAL, REPORT, RESULT, WORKING_CERTIFICATE
 from calib.bench.technician import BENCH
 from calib.certificate import lever_arms_of
 from calib.inputs import require_six_axes
+from calib.messages import Message, language, message, text
 from calib.procedure import plan
 from calib.procedure.schema import Procedure
 from calib.reports.text import as_text
@@ -40,7 +42,7 @@ from imudrv.service.settings import Settings
 from imudrv.signals import SIGHUP
 from imudrv.sinks.history import History
 from imudrv.site import Site
-from imudrv.terminal import INTERRUPTED, OK
+from imudrv.terminal import INTERRUPTED, NOT_GOOD, OK
 from imudrv.units import MM
 
 PROCEDURE: Final = "three-rotations"
@@ -72,6 +74,8 @@ class RunOptions:
         Name or path; None: `PROCEDURE`.
     hands_free : bool
         Proceed by the sensors alone, without keys.
+    accept : bool
+        Accept the result without a person, unless a verdict is bad.
     rehearse : bool
         Use a simulated unit and technician, hands free.
     speed : str
@@ -80,6 +84,8 @@ class RunOptions:
         Steps of an existing session to do again.
     plan : bool
         Only show the procedure and its expected accuracy.
+    language : str or None
+        Language of the operator; None: that of the system.
     """
 
     folder: Path
@@ -89,10 +95,12 @@ class RunOptions:
     site: Path | None = None
     procedure: str | None = None
     hands_free: bool = False
+    accept: bool = False
     rehearse: bool = False
     speed: str = "1"
     redo: Sequence[str] = ()
     plan: bool = False
+    language: str | None = None
 
     @property
     def is_rehearsal(self) -> bool:
@@ -103,6 +111,10 @@ class RunOptions:
     def has_operator(self) -> bool:
         """Whether an operator presses keys."""
         return not (self.hands_free or self.is_rehearsal)
+
+    def say(self, console: Console, what: Message) -> None:
+        """Print a message in the language of the operator."""
+        console.print(text(what, language(self.language)), markup=False, highlight=False, soft_wrap=True)
 
 
 def new_folder() -> Path:
@@ -123,7 +135,8 @@ def run(options: RunOptions, console: Console) -> int:
     Returns
     -------
     int
-        Exit code: 0 at the session's end, 130 when it can be resumed.
+        Exit code: 0 at the session's end; 130 when it can be resumed; 3 when nobody was there to accept the
+        result.
 
     Raises
     ------
@@ -146,7 +159,9 @@ def open_or_create(options: RunOptions, console: Console) -> Session:
     session = Session.open(options.folder)
     try:
         _require_resumable(session, options)
-        resume(session, console, options.redo, asks=options.has_operator)
+        resume(
+            session, console, options.redo, language(options.language), _ask if options.has_operator else None
+        )
     except BaseException:
         session.close()
         raise
@@ -186,9 +201,10 @@ def conduct(session: Session, options: RunOptions, console: Console) -> int:
         layout,
         service,
         queue,
-        OperatorScreen(console),
+        OperatorScreen(console, language(options.language)),
         Keyboard(),
         hands_free=not options.has_operator,
+        accepts=options.accept or (options.is_rehearsal and not options.has_operator),
         begin=begin,
     )
     worker = Thread(target=controller.run, name="controller")
@@ -203,20 +219,27 @@ def conduct(session: Session, options: RunOptions, console: Console) -> int:
             if simulated is not None:
                 simulated.end()
             if not controller.outcome:
-                console.print(f"accepted steps: {', '.join(session.accepted) or 'none'}", markup=False)
-                resume_command = f"resume with: calib run --session {session.folder}"
-                console.print(resume_command, markup=False, soft_wrap=True)
+                for line in accepted_result(session):
+                    options.say(console, line)
+                options.say(console, message("accepted_steps", steps=steps_message(session)))
+                options.say(console, message("resume_with", folder=str(session.folder)))
     if controller.error is not None:
         raise controller.error
     if not controller.outcome:
-        return INTERRUPTED
-    console.print(controller.outcome, markup=False, highlight=False, soft_wrap=True)
+        return NOT_GOOD if controller.is_undecided else INTERRUPTED
+    for line in controller.outcome:
+        options.say(console, line)
     if simulated is not None:
         result = session.folder / RESULT
         found = lever_arms_of(read_calibration(result), str(result))
         against = comparison(found, simulated.truth(layout), "the simulated unit")
         console.print(as_text(against), markup=False, highlight=False, soft_wrap=True)
     return OK
+
+
+def _ask() -> bool:
+    with Keyboard() as keys:
+        return keys.wait_for_answer()
 
 
 def _check(options: RunOptions, exists: bool) -> None:
@@ -259,11 +282,7 @@ def _create(options: RunOptions, console: Console) -> Session:
     place = settings_file.read_file(site, Site)
     worst_mm = float(plan.predicted(procedure.model, place.model).differences_sigma.max()) / MM
     minutes = plan.duration_s(procedure.model) / 60.0
-    expected = (
-        f"session {folder}: about {minutes:.0f} min, expected accuracy of the differences: "
-        f"{worst_mm:.3f} mm (1 sigma)"
-    )
-    console.print(expected, markup=False, soft_wrap=True)
+    options.say(console, message("expected", folder=str(folder), minutes=minutes, worst_mm=worst_mm))
     return Session.create(
         folder,
         procedure=EmbeddedFile.of(name, procedure.content),

@@ -16,7 +16,7 @@ from calib.cli.arguments import (
 from calib.estimation.result import Extra
 from calib.identification import EstimationOptions, identify, prior_calibration
 from calib.lever_arms.gauge import Gauge, LeverArms, convert
-from calib.reports.identification import document, report_html
+from calib.reports.identification import report_html, terminal_document
 from calib.reports.text import print_document
 from calib.reports.truth import comparison
 from calib.result_file import result_document, write_json
@@ -57,6 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_certificate_output(parser)
     add("--json", type=Path, metavar="R.json", help="the whole result as JSON")
     add("--report", type=Path, metavar="R.html", help="report with figures, one file")
+    add("-v", "--verbose", action="store_true", help="print the whole report, not only the result")
     text = "true unit of a simulation: the result is compared with it at the end, and does not depend on it"
     add("--truth", type=Path, metavar="T.yaml", help=text)
 
@@ -100,7 +101,7 @@ def run(arguments: argparse.Namespace) -> None:
         write(arguments.output, certificate(result, arms), key)
         written.append(written_text(arguments.output, prior.calibration, arms))
     finally:
-        print_document(document(result, gauges))
+        print_document(terminal_document(result, gauges, arguments.verbose))
         say("\n".join(written))
     if arguments.truth is not None:
         true = lever_arms_of(read_calibration(arguments.truth), str(arguments.truth))

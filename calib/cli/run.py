@@ -33,7 +33,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="only show the steps, how long they take, and the expected accuracy",
     )
-    add("--hands-free", action="store_true", help="continue by the sensors alone, without keys")
+    add(
+        "--hands-free",
+        action="store_true",
+        help="continue by the sensors alone; the result is accepted at a terminal, or with --accept",
+    )
+    text = "accept the result without a person, unless a verdict is bad"
+    add("--accept", action="store_true", help=text)
+    add("--language", metavar="L", help="en or zh_CN; default: the system's")
     add("--rehearse", action="store_true", help="use a simulated unit and technician")
     add("--speed", default="1", metavar="X", help="speed of the rehearsal: 1, 10, ... or max")
 

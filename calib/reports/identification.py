@@ -4,6 +4,7 @@ The report is a function of the result: it computes only means, extremes and oth
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import chain
 from math import hypot
@@ -16,7 +17,7 @@ from calib.estimation.result import LeverArmEstimate, ParameterEstimate, TurnRes
 from calib.estimation.runs import Priors, Run
 from calib.identification import CaptureSummary, IdentificationResult, scatter
 from calib.lever_arms.gauge import LeverArms
-from calib.messages import english
+from calib.messages import Message, english, message, verbatim
 from calib.reports import figures
 from calib.reports.document import Block, Document, Figure, KeyValues, Paragraph, Section, Table, sanitise
 from calib.reports.format import counted, decimals, mm, three_digits
@@ -55,6 +56,28 @@ def document(identification: IdentificationResult, arms: Sequence[LeverArms]) ->
     )
 
 
+def terminal_document(
+    identification: IdentificationResult, arms: Sequence[LeverArms], verbose: bool = False
+) -> Document:
+    """Return the result with the verdict at the end, as text that scrolls away is read.
+
+    Parameters
+    ----------
+    identification, arms
+        As for `document`.
+    verbose : bool
+        The other sections precede the result.
+
+    Returns
+    -------
+    Document
+    """
+    whole = document(identification, arms)
+    result, *others = whole.sections
+    marks, *tables = result.blocks
+    return replace(whole, sections=(*(others if verbose else ()), Section(result.title, (*tables, marks))))
+
+
 def report_html(identification: IdentificationResult, arms: Sequence[LeverArms]) -> str:
     """Return the report as one HTML file with its figures, see `document`."""
     return as_html(document(identification, arms))
@@ -67,7 +90,7 @@ def arms_text(arms: LeverArms) -> str:
 
 def _result(identification: IdentificationResult, arms: Sequence[LeverArms]) -> Iterator[Block]:
     result = identification.result
-    yield KeyValues(tuple(verdict(identification)))
+    yield KeyValues(tuple((mark, english(text)) for mark, text in verdict(identification)))
     yield Paragraph("u is the standard uncertainty (k = 1), U the expanded one (k = 2).")
     yield from map(_arms_table, arms)
     sigma = result.differences_sigma
@@ -112,7 +135,7 @@ def _arms_table(arms: LeverArms) -> Table:
     )
 
 
-def verdict(identification: IdentificationResult) -> Iterator[tuple[str, str]]:
+def verdict(identification: IdentificationResult) -> Iterator[tuple[str, Message]]:
     """Evaluate an identification.
 
     Parameters
@@ -122,38 +145,38 @@ def verdict(identification: IdentificationResult) -> Iterator[tuple[str, str]]:
 
     Yields
     ------
-    (str, str)
+    (str, Message)
         'good', 'note', 'caution' or 'bad', and a sentence that gives the reason.
     """
     result = identification.result
-    worst = float(result.differences_sigma.max())
-    nine = result.gauge == "given"
+    parts = message("nine_components") if result.gauge == "given" else message("six_differences")
     yield (
         "good",
-        f"{'All nine components' if nine else 'The six differences'} of the sensing points are determined by "
-        f"{counted(len(result.turns), 'rotation')}, method {result.method}; the largest standard uncertainty "
-        f"of a difference is {mm(worst, '.3f')} mm.",
+        message(
+            "determined",
+            parts=parts,
+            rotations=len(result.turns),
+            method=result.method,
+            worst_mm=float(result.differences_sigma.max()) / MM,
+        ),
     )
     if result.consistent:
         yield _agreement(result)
     for refusal in result.refusals:
-        yield "bad", f"{sanitise(refusal[0].upper() + refusal[1:])}. No certificate is made."
+        yield "bad", message("refused", why=verbatim(sanitise(refusal[0].upper() + refusal[1:])))
     yield "note", _redundancy(result)
     for n in result.parameters:
         if n.name == "skew_s" and not n.observable:
-            yield (
-                "note",
-                "These rotations do not determine the gyro-accelerometer skew; the uncertainties include one "
-                f"of {n.prior * 1e3:g} ms (1 sigma).",
-            )
+            yield "note", message("skew_unknown", prior_ms=n.prior * 1e3)
     for k, run in enumerate(identification.runs):
         if run.aligned.motion is not None:
-            yield "caution", f"Run {k + 1} moved during its alignment: {sanitise(run.aligned.motion)}."
+            motion = verbatim(sanitise(str(run.aligned.motion)))
+            yield "caution", message("run_moved", run=k + 1, motion=motion)
     for note in result.notes:
-        yield "caution", f"{sanitise(note)}."
+        yield "caution", verbatim(f"{sanitise(note)}.")
 
 
-def _redundancy(result: LeverArmEstimate) -> str:
+def _redundancy(result: LeverArmEstimate) -> Message:
     """Return how far the rotations check each other."""
     shifts = [
         (float(np.abs(one.shift_m).max()), one.label)
@@ -161,39 +184,28 @@ def _redundancy(result: LeverArmEstimate) -> str:
         if one.shift_m is not None
     ]
     if not shifts:
-        return (
-            "The lever arms are determined but not checked: no rotation is redundant. A second set of "
-            "rotations in the opposite direction checks them."
-        )
+        return message("not_checked")
     shift, label = max(shifts, key=lambda item: item[0])
-    return (
-        f"Omitting one rotation changes no component by more than {mm(shift, '.3f')} mm ({sanitise(label)})."
-    )
+    return message("omitted", shift_mm=shift / MM, label=sanitise(label))
 
 
-def _agreement(result: LeverArmEstimate) -> tuple[str, str]:
+def _agreement(result: LeverArmEstimate) -> tuple[str, Message]:
     n = result.degrees_of_freedom
     if n == 0:
-        return "caution", "As many equations as parameters: there are no residuals to test the model with."
+        return "caution", message("no_residuals")
     low, high = float(chdtri(n, 0.975)), float(chdtri(n, 0.025))
-    interval = f"95 % interval {low:.1f} to {high:.1f}"
-    statistic = f"chi-square {result.chi_square:.1f} with {n} degrees of freedom, {interval}"
+    statistic = message("chi_square", value=result.chi_square, n=n, low=low, high=high)
     if not result.consistent:
-        return "bad", f"The velocities contradict the model: {statistic}."
+        return "bad", message("contradicted", statistic=statistic)
     if result.chi_square > high:
-        return (
-            "caution",
-            f"The residuals are larger than the noise explains: {statistic}. The uncertainties may be too "
-            f"small by a factor of {(result.chi_square / n) ** 0.5:.2f}.",
+        return "caution", message(
+            "residuals_large", statistic=statistic, factor=(result.chi_square / n) ** 0.5
         )
     if result.chi_square < low:
-        return (
-            "note",
-            f"The residuals are smaller than expected: {statistic}. The uncertainties are conservative.",
-        )
+        return "note", message("residuals_small", statistic=statistic)
     if 2 * len(result.turns) <= 6:  # two equations per rotation for six differences: none checks the arms
-        return "good", f"The residuals at rest agree with the noise: {statistic}."
-    return "good", f"The velocities agree with the model: {statistic}."
+        return "good", message("rests_agree", statistic=statistic)
+    return "good", message("velocities_agree", statistic=statistic)
 
 
 def _inputs(identification: IdentificationResult) -> Iterator[Block]:
@@ -268,7 +280,7 @@ def _rotation(run: Run) -> Iterator[tuple[str, str]]:
         "alignment",
         f"{aligned.duration_s:.1f} s: heading {aligned.heading_rad / DEG:.3f} deg, u "
         f"{aligned.heading_sigma_rad / DEG:.3f} deg; level u {aligned.level_sigma_rad / ARCSEC:.1f} arcsec; "
-        f"{sanitise(aligned.motion) if aligned.motion else 'no motion'}",
+        f"{sanitise(str(aligned.motion)) if aligned.motion else 'no motion'}",
     )
 
 
@@ -337,7 +349,7 @@ def _speed(v_n: Array) -> float:
 def _estimate(identification: IdentificationResult) -> Iterator[Block]:
     result = identification.result
     yield from _observability(result, identification.priors.arm)
-    yield Paragraph(f"Consistency. {_agreement(result)[1]}")
+    yield Paragraph(f"Consistency. {english(_agreement(result)[1])}")
     yield _noise(result)
     yield Table("Prior uncertainties", ("", "u"), tuple(priors_rows(identification.priors)))
     if result.parameters:

@@ -16,6 +16,7 @@ COMMANDS: Final = {
     "status": "Print the health of a running service; exit code 0 ok, 3 warning, 4 failure.",
     "decode": "Decode a capture to pulse increments.",
     "compensate": "Compensate a capture: increments in body axes.",
+    "plot": "Draw a first look at a capture or recording: pulses, rates, losses, temperatures.",
     "export": "Convert a recording to another format.",
     "pack": "Compress a recording.",
     "sim": "Simulate a unit: to a capture, or live on a port.",

@@ -172,7 +172,7 @@ def test_the_operator_sees_every_step_and_the_result(
 ) -> None:
     folder, said = undisturbed
     # In fast time the screen, which shows the newest state only, passes over some of them.
-    for words in ("Z up", "X up", "Y up", "HANDS OFF, ALIGNING", "DONE"):
+    for words in ("Z up", "X up", "Y up", "align: HANDS OFF", "DONE"):
         assert any(words in line for line in said.splitlines()), words
     assert f"report: {folder / 'report.html'}" in said
     assert "residual velocity after half a turn" in said

@@ -204,7 +204,7 @@ def test_a_chosen_channel_of_a_log_of_two_units_is_named_in_certificate_and_repo
             units += text.splitlines(keepends=True)
         (here / f"{pose}.log").write_text("".join(sorted(units, key=lambda line: line[:20])))
     logs = ["identify", "x.log", "y.log", "z.log", "--profile", "imu50-can", "--calibration", "unit.yaml"]
-    logs += ["--site", "site.yaml", "--channel", "can0", "-o", "chosen.yaml"]
+    logs += ["--site", "site.yaml", "--channel", "can0", "-o", "chosen.yaml", "-v"]
     assert main(logs) == 0
     assert "z.log, imu50-can, channel can0" in capsys.readouterr().out
     provenance = yaml.safe_load((here / "chosen.yaml").read_text())["provenance"]

@@ -13,7 +13,8 @@ from rich.cells import cell_len
 from calib.estimation.result import LeaveOneOut
 from calib.identification import IdentificationResult, PriorCalibration, identify
 from calib.lever_arms.gauge import LeverArms, convert
-from calib.reports.identification import arms_text, document, report_html, verdict
+from calib.messages import english
+from calib.reports.identification import arms_text, document, report_html, terminal_document, verdict
 from calib.reports.text import as_text
 from imudrv.cli import main as imudrv
 from imudrv.sim.scenario import NOMINAL
@@ -36,6 +37,10 @@ motion:
 unit:
   noise: {{arw_deg_per_sqrt_h: 0.002, vrw_m_s_per_sqrt_h: 0.003}}
 """
+
+
+def verdict_texts(identification: IdentificationResult) -> list[tuple[str, str]]:
+    return [(mark, english(text)) for mark, text in verdict(identification)]
 
 
 @pytest.fixture(scope="module")
@@ -118,6 +123,18 @@ def test_text_from_files_is_escaped(
     assert "\x1b" not in as_text(document(identification, arms))
 
 
+def test_on_a_terminal_the_verdict_is_last_and_the_rest_only_on_request(
+    identification: IdentificationResult, arms: tuple[LeverArms, LeverArms]
+) -> None:
+    short = as_text(terminal_document(identification, arms))
+    last = short.rstrip().splitlines()[-8:]
+    assert any(line.strip().startswith("good") for line in last)
+    assert len(short.splitlines()) < 45  # a screen, of the 258 lines of the whole
+    whole = as_text(terminal_document(identification, arms, verbose=True))
+    assert whole.index("THE ESTIMATE") < whole.index("RESULT")
+    assert whole.rstrip().splitlines()[-8:] == last
+
+
 def test_the_text_fits_80_columns_whatever_the_names(
     identification: IdentificationResult, arms: tuple[LeverArms, LeverArms]
 ) -> None:
@@ -165,7 +182,7 @@ def test_the_verdict_is_bad_where_the_data_contradict_the_model(identification: 
     marks = {}
     for ratio in (0.5, 1.0, 1.5, 3.0):
         result = replace(identification.result, chi_square=ratio * n)
-        marks[ratio] = list(verdict(replace(identification, result=result)))[1]
+        marks[ratio] = verdict_texts(replace(identification, result=result))[1]
     assert [marks[ratio][0] for ratio in marks] == ["note", "good", "caution", "bad"]
     assert "by a factor of 1.22" in marks[1.5][1]
     assert "No certificate is made" in marks[3.0][1]
@@ -176,7 +193,7 @@ def test_dither_in_the_increments_is_a_bad_verdict_with_the_remedy(
 ) -> None:
     runs = identification.result.runs
     shaken = replace(identification.result, runs=(replace(runs[0], H_rest=0.07), *runs[1:]))
-    bad = [text for mark, text in verdict(replace(identification, result=shaken)) if mark == "bad"]
+    bad = [text for mark, text in verdict_texts(replace(identification, result=shaken)) if mark == "bad"]
     assert len(bad) == 1
     assert bad[0].startswith("The gyro increments carry dither or vibration: expected H of at most 0.002")
     assert "got 0.07 (" in bad[0]
@@ -184,7 +201,7 @@ def test_dither_in_the_increments_is_a_bad_verdict_with_the_remedy(
 
 
 def test_three_rotations_give_no_false_caution(identification: IdentificationResult) -> None:
-    marks = list(verdict(identification))
+    marks = verdict_texts(identification)
     assert {mark for mark, _ in marks} == {"good", "note"}
     notes = " ".join(text for mark, text in marks if mark == "note")
     assert "determined but not checked: no rotation is redundant" in notes
@@ -198,7 +215,7 @@ def test_the_change_without_a_redundant_rotation_is_reported(identification: Ide
     result = replace(
         identification.result, leave_one_out=(LeaveOneOut("z#1", 6, shift), LeaveOneOut("x#1", 4, None))
     )
-    notes = [text for mark, text in verdict(replace(identification, result=result)) if mark == "note"]
+    notes = [text for mark, text in verdict_texts(replace(identification, result=result)) if mark == "note"]
     assert notes[0] == "Omitting one rotation changes no component by more than 0.020 mm (z#1)."
 
 
