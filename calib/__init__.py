@@ -23,6 +23,7 @@ Data flow; every module can be read alone::
 
     procedure       the bench procedure as data, and its state machine
     bench           a session with an operator: journal, recordings, screen
+    noise           Allan deviations of a long rest, and their coefficients
     validation      navigation with and without compensation, on recordings and simulated units
     dither          effect of gyro dither on the size effect
     reports         reports as text, for a terminal and as HTML
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
     from calib.identification import EstimationOptions as EstimationOptions
     from calib.identification import identify as identify
     from calib.lever_arms.gauge import LeverArms as LeverArms
+    from calib.noise.analysis import analyse_noise as analyse_noise
 
 # Imported at first use, so that a program pays only for what it needs.
 _MODULES = {
@@ -54,6 +56,7 @@ _MODULES = {
     "PlannedRotation": "calib.estimation.predict",
     "Session": "calib.bench.session",
     "align": "calib.alignment",
+    "analyse_noise": "calib.noise.analysis",
     "identify": "calib.identification",
     "load_procedure": "calib.api",
     "predict": "calib.api",

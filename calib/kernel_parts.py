@@ -4,7 +4,9 @@ import numpy as np
 
 from calib.detection.blocks import Block, BlockSums
 from calib.detection.tracking import AttitudeTracker, RestAverages, RotationTracker, StillnessDetector
-from imudrv.records import INCREMENTS
+from calib.noise.pyramid import Pyramid
+from calib.noise.stretches import StretchSplitter
+from imudrv.records import INCREMENTS, PULSES
 
 
 def detection() -> None:
@@ -21,3 +23,11 @@ def detection() -> None:
     attitude.lean(up)
     attitude.azimuth(up)
     _ = turned.axis_tilt
+
+
+def noise() -> None:
+    """Allan deviations of a rest."""
+    splitter, pyramid = StretchSplitter(1.0, np.ones(6), np.ones(6)), Pyramid(6)
+    splitter.feed(np.ones(1, PULSES))
+    pyramid.feed(*splitter.close())
+    pyramid.end_stretch()

@@ -136,6 +136,11 @@ def bench() -> None:
     import_module("calib.kernel_parts").detection()
 
 
+def allan_deviations() -> None:
+    """Noise of a rest, likewise."""
+    import_module("calib.kernel_parts").noise()
+
+
 class _Reporter(_events.Listener):  # type: ignore[misc]
     def on_start(self, event: Any) -> None:
         _report(COMPILING)

@@ -21,6 +21,10 @@ COMMANDS: Final = {
         "code 3 if the verdict is bad."
     ),
     "identify": "Identify lever arms from captures of rotations: certificate and report.",
+    "noise": (
+        "Compute the noise of a unit from a long rest: Allan deviations and their coefficients; "
+        "exit code 3 if it was not at rest."
+    ),
     "align": "Align a rest: level, heading, and its readings against the site; exit code 3 if it moved.",
     "validate": "Navigate the same pulses with and without compensation; exit code 3 if a verdict is bad.",
     "gauge": "Convert the lever arms of a certificate to another gauge, exactly, with their covariance.",

@@ -10,6 +10,8 @@ import numpy as np
 
 from calib.estimation.result import RunResult, TurnResult
 from calib.estimation.runs import Run
+from calib.noise.analysis import ChannelNoise
+from calib.noise.model import KINDS, variance_terms
 from imudrv.arrays import Array
 from imudrv.units import MM
 
@@ -238,4 +240,47 @@ def directions(sigma: Array, rank: int, limit_m: float) -> bytes:
         axes.set(xlabel="principal direction of (r_x, r_y, r_z)", ylabel="sigma (mm)")
         axes.set_xticks(at)
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7)
+    return svg.getvalue()
+
+
+def allan_deviations(tau_s: Array, channels: Sequence[ChannelNoise], unit: str, si: float) -> bytes:
+    """Draw the Allan deviation of sensors with its 68 % band, the fitted model and the five parts of it.
+
+    Parameters
+    ----------
+    tau_s : ndarray, shape (n,)
+        Averaging times.
+    channels : sequence of ChannelNoise
+        The sensors.
+    unit : str
+        Unit of the deviation.
+    si : float
+        That unit, rad/s or m/s^2.
+
+    Returns
+    -------
+    bytes
+        SVG.
+    """
+    with _drawing(2.6) as (figure, svg):
+        panels = figure.subplots(1, len(channels), sharey=True)
+        for axes, channel, colour in zip(panels, channels, _COLOURS, strict=True):
+            fit, deviation = channel.fit, channel.deviation / si
+            axes.loglog(tau_s, deviation, ".", color=_GREY, markersize=2)
+            at = np.searchsorted(tau_s, fit.tau_s)
+            band = fit.deviation_sigma / si
+            low = np.maximum(deviation[at] - band, 0.1 * deviation[at])
+            axes.fill_between(fit.tau_s, low, deviation[at] + band, color=colour, alpha=0.25, linewidth=0)
+            axes.loglog(fit.tau_s, deviation[at], ".", color=colour, markersize=3)
+            bottom, top = 0.5 * deviation.min(), 2.0 * deviation.max()
+            if fit.is_accepted:
+                terms = variance_terms(fit.tau_s) * fit.squares
+                axes.loglog(fit.tau_s, np.sqrt(terms.sum(axis=1)) / si, color=colour)
+                for kind, term in zip(KINDS, terms.T, strict=True):
+                    if term.max() > 0.0:
+                        axes.loglog(fit.tau_s, np.sqrt(term) / si, ":", color=_GREY, linewidth=0.7)
+                        k = int(np.argmax(term))
+                        axes.annotate(kind, (fit.tau_s[k], np.sqrt(term[k]) / si), fontsize=7)
+            axes.set(title=channel.name, xlabel="averaging time (s)", ylim=(bottom, top))
+        panels[0].set_ylabel(f"Allan deviation ({unit})")
     return svg.getvalue()
