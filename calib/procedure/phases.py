@@ -18,10 +18,11 @@ from calib.messages import Message, message
 from calib.procedure import prompts
 from calib.procedure.attempt import Attempt
 from calib.procedure.events import PREFLIGHT, Accepted, Checked, Phase, Rejected, Turned
-from calib.procedure.preflight import PREFLIGHT_S, axis_faults, sensor_faults
+from calib.procedure.preflight import PREFLIGHT_S, axis_faults, dither_faults, sensor_faults
 from calib.procedure.progress import Progress
 from calib.procedure.prompts import MIN_ROTATION_RAD, READY_S, Prompt
 from calib.procedure.transitions import Outcome
+from imudrv.arrays import Array
 from imudrv.errors import InputError
 from imudrv.nav.alignment import MIN_ALIGNMENT_S, Alignment
 from imudrv.nav.earth import EARTH_RATE
@@ -82,6 +83,7 @@ class Preflight(PhaseState):
         super().__init__(progress, PREFLIGHT_S)
         self.step_id, self.number = PREFLIGHT, 1
         self._averages = RestAverages()
+        self._angles: list[Array] = []
         self._failed = False
 
     def prompt(self) -> Prompt:
@@ -96,9 +98,10 @@ class Preflight(PhaseState):
             self._failed = self._failed and not p.stillness.moving
             return None
         self._averages.feed(block)
+        self._angles.append(block.rows["dtheta_b"].copy())
         if p.elapsed_s < PREFLIGHT_S - _HALF_BLOCK_S:
             return None
-        averages = self._averages
+        averages, still = self._averages, self._angles
         rate_noise, force_noise = averages.noise()
         limits = motion_limits(rate_noise, force_noise)
         # motion too small to be detected before the noise was known
@@ -107,8 +110,10 @@ class Preflight(PhaseState):
             rate, force = limits[0] / DEG, limits[1] / MG
             p.reasons = (message("not_at_rest", rate_deg_per_s=rate, force_mg=force),)
             return None
+        kept = still[len(still) - round(p.elapsed_s / (BLOCK_NS * NS)) :]
         self._begin()
         p.reasons = sensor_faults(averages, p.status, p.procedure.limits, p.calibration)
+        p.reasons += dither_faults(np.concatenate(kept), round(p.interval_s / NS))
         p.reasons += axis_faults(averages, p.step, p.procedure.limits, p.site)
         if p.reasons:
             self._fail()
@@ -128,6 +133,7 @@ class Preflight(PhaseState):
 
     def _begin(self) -> None:
         self._averages, self.progress.elapsed_s = RestAverages(), 0.0
+        self._angles = []
 
     def _fail(self) -> None:
         """Report the faults, once until the unit is moved."""

@@ -10,6 +10,7 @@ again. A `Budget` says how the units and the bench differ from an ideal one.
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from functools import partial
 from typing import Any, Final
 
@@ -20,13 +21,15 @@ from calib.certificate import lever_arms_of, sensing_points
 from calib.estimation.joint import estimate_joint
 from calib.estimation.plain import estimate_plain
 from calib.estimation.priors import Priors
-from calib.estimation.result import TO_DIFFERENCES, LeverArmEstimate
-from calib.estimation.runs import NavigationOptions, Run, navigate_capture
-from calib.validation.simulate import LAYOUT, simulated_pulses, true_calibration
+from calib.estimation.result import TO_DIFFERENCES, ChiSquare, LeverArmEstimate
+from calib.estimation.runs import CaptureRuns, NavigationOptions, Run, navigate_capture
+from calib.validation.simulate import simulated_pulses, true_calibration
+from imudrv import profiles
 from imudrv.arrays import Array
 from imudrv.calibration import Calibration, SizeEffect, Temperature
 from imudrv.files.settings_file import parse
 from imudrv.sim.scenario import NOMINAL, Residuals, Scenario, Unit
+from imudrv.site import Site
 from imudrv.units import DEG, DEG_PER_H, MM, PPM, UG, URAD
 
 REST_S: Final = 60.0
@@ -35,6 +38,9 @@ REST_S: Final = 60.0
 
 AFTER_S: Final = 12.0
 """Rest after a rotation, s."""
+
+
+SITE: Final = Site(latitude_deg=28.2, longitude_deg=113.0, height_m=60.0)
 
 
 POSES: Final = ("z_up", "x_up", "y_up")
@@ -78,11 +84,20 @@ class Budget:
     arms_mm: float = 35.0  # maximum of each component before the centroid is subtracted
     skew_ms: float | None = None  # of every unit; None: drawn from its prior
     pulse_factor: float = 1.0  # accelerometer pulses that many times coarser
-    dither_arcsec: float = 0.0  # amplitude left in the gyro increments, 400, 392 and 412 Hz
+    dither_arcsec: float = 0.0  # amplitude of the dither, 400, 392 and 412 Hz
     pose_bias_ug: float = 0.0  # change of the accelerometer biases from pose to pose
     warming_k_per_min: float = 0.0  # with 30 ug, 30 ppm, 0.003 deg/h and 2 ppm per kelvin
     wobble_deg: float = 0.0
-    motor_mg: float = 0.0  # vibration of the bench at 25 Hz
+    motor_mg: float = 0.0  # vibration of the bench
+    motor_hz: float = 25.0
+    lean_urad: float = 0.0  # tilt of the bench a second after each turn
+    dither_share: float = 1.0  # of the dither that is left in the increments
+    case_reaction: float = 0.0  # of the dither, as a rotation of the case
+    vrw_m_s_per_sqrt_h: float = 0.003
+    signs: tuple[int, ...] = (1,)  # of the sets of three rotations
+    profile: str = "imu50-rs422"
+    interval_ms: float = 1.0
+    one_file: bool = False  # the unit restarts between the poses
     priors: Priors = PRIORS  # the unit's skew is drawn from its prior
 
 
@@ -105,6 +120,15 @@ BUDGETS: Final = {
     "176-deg": Budget(angle_deg=176.0),
     "long-arms": Budget(arms_mm=150.0),
     "motor": Budget(motor_mg=1.0),
+    "six": Budget(signs=(1, -1)),
+    "case-reaction": Budget(dither_arcsec=150.0, dither_share=0.0, case_reaction=0.01),
+    "restart": Budget(signs=(1, -1), one_file=True),
+    "turns-1-s": Budget(turn_s=1.0),
+    "turns-5-s": Budget(turn_s=5.0),
+    "lean": Budget(lean_urad=20.0),
+    "200-hz": Budget(interval_ms=5.0),
+    "400-hz": Budget(interval_ms=2.5),
+    "can": Budget(profile="imu50-can"),
     **{f"dither-{amplitude}": Budget(dither_arcsec=amplitude) for amplitude in (3, 10, 100)},
     **{f"skew-{skew}": Budget(skew_ms=skew) for skew in (0.3, 1.0)},
 }
@@ -123,6 +147,8 @@ class Statistics:
     ratio: float
     nees: float
     nees_band: tuple[float, float]
+    worst_sigma: float  # largest error of a difference, in its uncertainty
+    band_held: float  # share of cases whose scatter at rest is in its 95 % band
     chi_square_per_degree: float
 
 
@@ -187,7 +213,10 @@ def scenario(seed: int, calibration: Calibration, pose: str, sign: int, budget: 
     unit: dict[str, Any] = {
         "calibration": json.loads(calibration.model_dump_json(exclude_none=True)),
         "accelerometer_skew_s": skew_s,
-        "noise": {"arw_deg_per_sqrt_h": budget.arw_deg_per_sqrt_h, "vrw_m_s_per_sqrt_h": 0.003},
+        "noise": {
+            "arw_deg_per_sqrt_h": budget.arw_deg_per_sqrt_h,
+            "vrw_m_s_per_sqrt_h": budget.vrw_m_s_per_sqrt_h,
+        },
         "bias_steps": [{"at_s": 0.0, "accelerometer_ug": moved_ug.tolist()}],
     }
     if budget.dither_arcsec:
@@ -195,7 +224,8 @@ def scenario(seed: int, calibration: Calibration, pose: str, sign: int, budget: 
         unit["dither"] = {
             "amplitude_arcsec": amplitude,
             "frequency_hz": [400.0, 392.0, 412.0],
-            "in_increments": 1.0,
+            "in_increments": budget.dither_share,
+            "case_reaction": budget.case_reaction,
         }
     if budget.warming_k_per_min:
         unit["temperature"] = {
@@ -206,7 +236,7 @@ def scenario(seed: int, calibration: Calibration, pose: str, sign: int, budget: 
         "format": "imu50-scenario",
         "version": 1,
         "seed": int(bench.integers(2**63)),
-        "site": {"latitude_deg": 28.2, "longitude_deg": 113.0, "height_m": 60.0},
+        "site": SITE.model_dump(exclude_none=True, exclude={"format", "version"}),
         "start": {"pose": pose, "tilt_mrad": tilt.tolist(), "pivot_offset_mm": pivot.tolist()},
         "motion": [
             {"rest": {"duration_s": REST_S}},
@@ -214,32 +244,57 @@ def scenario(seed: int, calibration: Calibration, pose: str, sign: int, budget: 
         ],
         "unit": unit,
     }
+    if budget.lean_urad:
+        lean_deg = budget.lean_urad * URAD / DEG
+        document["motion"][1]["turns"]["arrest_s"] = 1.0
+        document["motion"] += [
+            {"rotate": {"angle_deg": lean_deg, "duration_s": 0.5, "axis_n": [0.6, 0.8, 0.0]}},
+            {"rest": {"duration_s": budget.arrest_s - 1.5}},
+        ]
     if budget.turns > 1:
         document["motion"].append({"rest": {"duration_s": AFTER_S - budget.arrest_s}})
     if budget.motor_mg:
-        document["motor"] = {"frequency_hz": 25.0, "mg": [budget.motor_mg, 0.0, budget.motor_mg]}
+        document["motor"] = {"frequency_hz": budget.motor_hz, "mg": [budget.motor_mg, 0.0, budget.motor_mg]}
     return parse(document, Scenario, "montecarlo")
 
 
-def case(seed: int, signs: tuple[int, ...], budget: Budget) -> tuple[list[Run], Array]:
-    """Return the runs of a unit and its true arms, (3, 3) m, with the centroid as origin."""
+def captures(seed: int, budget: Budget) -> list[CaptureRuns]:
+    """Return the captures of a unit, navigated: one of each pose and sign, or one of all."""
+    layout = profiles.load(budget.profile).layout()
+    layout = replace(layout, interval=Fraction(round(budget.interval_ms * 1e6)))
     real = true_unit(seed, budget)
-    runs: list[Run] = []
-    for sign in signs:
-        for pose in POSES:
-            turn = scenario(seed, real, pose, sign, budget)
-            found = navigate_capture(
-                partial(iter, [np.concatenate(list(simulated_pulses(turn)))]),
-                LAYOUT,
-                nominal(budget).without_size_effect(),
-                turn.site,
-                f"{pose}{sign:+d}",
-                NavigationOptions(priors=budget.priors),
-            )
-            if len(found.runs) != 1:
-                raise RuntimeError(f"case {seed}, {pose}: expected one run, rejected {found.rejected}")
-            runs += found.runs
-    return runs, lever_arms_of(real, f"case {seed}").r_b
+    turns = {
+        f"{pose}{sign:+d}": scenario(seed, real, pose, sign, budget)
+        for sign in budget.signs
+        for pose in POSES
+    }
+    data = {label: list(simulated_pulses(turn, layout)) for label, turn in turns.items()}
+    if budget.one_file:
+        data = {"all": [piece for pieces in data.values() for piece in pieces]}
+    return [
+        navigate_capture(
+            partial(iter, pieces),
+            layout,
+            nominal(budget).without_size_effect(),
+            SITE,
+            label,
+            NavigationOptions(priors=budget.priors),
+        )
+        for label, pieces in data.items()
+    ]
+
+
+def case(seed: int, budget: Budget) -> tuple[list[Run], Array]:
+    """Return the runs of a unit and its true arms, (3, 3) m, with the centroid as origin."""
+    runs = [run for capture in captures(seed, budget) for run in capture.runs]
+    if len(runs) != len(POSES) * len(budget.signs):
+        raise RuntimeError(f"case {seed}: expected {len(POSES) * len(budget.signs)} runs, got {len(runs)}")
+    return runs, true_arms(seed, budget)
+
+
+def true_arms(seed: int, budget: Budget) -> Array:
+    """Return the true arms of a seed, (3, 3) m, with the centroid as origin."""
+    return lever_arms_of(true_unit(seed, budget), f"case {seed}").r_b
 
 
 def statistics(method: str, found: Sequence[tuple[LeverArmEstimate, Array]]) -> Statistics:
@@ -263,6 +318,10 @@ def statistics(method: str, found: Sequence[tuple[LeverArmEstimate, Array]]) -> 
         ratio=predicted / scatter,
         nees=float(np.einsum("ni,nij,nj->n", six, inverse, six).mean()),
         nees_band=(low, high),
+        worst_sigma=max(worst_sigma(*one) for one in found),
+        band_held=float(
+            np.mean([_in_band(estimate.scatter or estimate.redundancy) for estimate, _ in found])
+        ),
         chi_square_per_degree=float(
             np.mean(
                 [
@@ -275,15 +334,13 @@ def statistics(method: str, found: Sequence[tuple[LeverArmEstimate, Array]]) -> 
     )
 
 
-def run_cases(seeds: Iterable[int], signs: tuple[int, ...], budget: Budget) -> list[Statistics]:
+def run_cases(seeds: Iterable[int], budget: Budget) -> list[Statistics]:
     """Identify many units with both methods.
 
     Parameters
     ----------
     seeds : iterable of int
         One for each case.
-    signs : tuple of int
-        Signs of the rotations: (1,) gives three rotations, (1, -1) six.
     budget : Budget
         Distribution of the units.
 
@@ -294,7 +351,19 @@ def run_cases(seeds: Iterable[int], signs: tuple[int, ...], budget: Budget) -> l
     """
     joint, plain = [], []
     for seed in seeds:
-        runs, truth = case(seed, signs, budget)
+        runs, truth = case(seed, budget)
         joint.append((estimate_joint(runs, budget.priors), truth))
         plain.append((estimate_plain(runs, budget.priors), truth))
     return [statistics("joint", joint), statistics("plain", plain)]
+
+
+def worst_sigma(estimate: LeverArmEstimate, truth: Array) -> float:
+    """Return the largest error of a difference, in its standard uncertainty."""
+    error = TO_DIFFERENCES @ (estimate.R_b - truth).ravel()
+    return float(np.abs(error / estimate.differences_sigma.ravel()).max())
+
+
+def _in_band(test: ChiSquare) -> bool:
+    """Whether the value of a test is in its 95 % band."""
+    low, high = test.band
+    return low <= test.value <= high

@@ -38,7 +38,7 @@ from imudrv.nav.earth import EARTH_RATE
 from imudrv.records import Flag, Records
 from imudrv.sim.scenario import NOMINAL
 from imudrv.site import Site
-from imudrv.units import DEG
+from imudrv.units import ARCSEC, DEG
 
 INTERVAL_NS = 2_000_000
 CHECK_S = 31.0  # the preflight and a little more
@@ -743,6 +743,21 @@ def test_temperature_noise_and_faults_are_held_against_the_limits(drive: Drive, 
     assert temperature == "gyro at 48.2 degC, certificate valid from 10 to 40: wait"
     assert noise.startswith("accelerometer noise 2.08 ")
     assert noise.endswith("mg rms at rest, expected at most 0.5: check the bench for vibration")
+
+
+def test_dither_that_the_rate_filter_leaves_is_found_before_the_first_step(
+    drive: Drive, turned: Records
+) -> None:
+    t = np.arange(len(turned)) * 2e-3  # the samples alias 400 Hz to 100 Hz
+    for amplitude_arcsec, count in ((2.0, 0), (10.0, 1)):
+        dithered = turned.copy()
+        dithered["dtheta_b"][:, 1] += np.diff(
+            amplitude_arcsec * ARCSEC * np.sin(2.0 * np.pi * 400.0 * t + 0.3), prepend=0.0
+        )
+        driver = drive().feed(part(dithered, 0.0, CHECK_S))
+        found = [text for one in driver.of(Rejected) for text in reasons(one)]
+        assert len(found) == count
+    assert found[0].startswith("gyro Y carries dither of 10 arcsec at 100 Hz, of which the rate filter ")
 
 
 def test_a_small_motion_before_the_noise_is_known_is_left_out_of_the_check(

@@ -18,6 +18,7 @@ from calib.estimation.priors import Priors
 from calib.estimation.result import CENTROID_BASIS, TO_DIFFERENCES, LeverArmEstimate
 from calib.estimation.runs import NavigationOptions, Run, navigate_capture, navigate_rotations
 from calib.validation import montecarlo
+from calib.validation.montecarlo import Budget
 from imudrv import profiles
 from imudrv.calibration import read_calibration
 from imudrv.capture import Capture
@@ -41,7 +42,7 @@ LATITUDE = 28.2 * DEG
 @pytest.fixture(scope="module")
 def simulated() -> tuple[list[Run], Array]:
     """Six rotations of a unit, and its true arms."""
-    runs, truth = montecarlo.case(5, (1, -1), montecarlo.BUDGETS["standard"])
+    runs, truth = montecarlo.case(5, montecarlo.BUDGETS["six"])
     return runs, truth
 
 
@@ -199,8 +200,8 @@ def test_many_units_are_found_as_well_as_predicted(
     signs: tuple[int, ...], skew_s: float, limit_mm: float
 ) -> None:
     cases = 12 if len(signs) == 1 else 8
-    budget = replace(montecarlo.BUDGETS["standard"], priors=replace(montecarlo.PRIORS, skew=skew_s))
-    of_joint, of_plain = montecarlo.run_cases(range(100, 100 + cases), signs, budget)
+    budget = Budget(signs=signs, priors=replace(montecarlo.PRIORS, skew=skew_s))
+    of_joint, of_plain = montecarlo.run_cases(range(100, 100 + cases), budget)
     assert of_joint.mean_rms_mm < limit_mm  # the requirement
     assert of_plain.mean_rms_mm > 5.0 * of_joint.mean_rms_mm
     # six degrees of freedom a case; once in 500
@@ -216,7 +217,7 @@ def test_many_units_are_found_as_well_as_predicted(
 @pytest.mark.parametrize("budget", ["bias", "misalignment", "slow", "tilted", "offset", "arw"])
 def test_a_harder_budget_widens_the_prediction_with_the_error(budget: str) -> None:
     cases = 4
-    found, _ = montecarlo.run_cases(range(200, 200 + cases), (1,), montecarlo.BUDGETS[budget])
+    found, _ = montecarlo.run_cases(range(200, 200 + cases), montecarlo.BUDGETS[budget])
     low, high = chi2.ppf([0.0005, 0.9995], 6 * cases) / cases
     assert low < found.nees < high
     least_mm = {"slow": 0.025, "arw": 0.017}.get(budget, 0.012)  # standard: 0.016
@@ -236,7 +237,7 @@ def test_a_skew_of_one_sample_is_within_the_uncertainty(
     monkeypatch.setattr(montecarlo, "scenario", skewed)
     worst = {0.0: 0.0, Priors().skew: 0.0}
     for seed in range(400, 404):
-        runs, truth = montecarlo.case(seed, signs, montecarlo.BUDGETS["standard"])
+        runs, truth = montecarlo.case(seed, Budget(signs=signs))
         for skew in worst:
             found = estimate_joint(runs, Priors(skew=skew))
             error = found.differences.ravel() - TO_DIFFERENCES @ truth.ravel()
@@ -258,7 +259,7 @@ def shaken(amplitude_arcsec: float, frequency_hz: float) -> tuple[list[Run], Arr
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(montecarlo, "scenario", with_dither)
-        runs: tuple[list[Run], Array] = montecarlo.case(3, (1,), montecarlo.BUDGETS["standard"])
+        runs: tuple[list[Run], Array] = montecarlo.case(3, Budget())
     return runs
 
 
@@ -345,7 +346,7 @@ def turntable() -> Callable[..., tuple[list[Run], Array]]:
     """Three rotations whose fixed point lies so far from the origin of b, and the true arms."""
 
     def make(pivot_mm: float, seed: int = 3) -> tuple[list[Run], Array]:
-        runs, truth = montecarlo.case(seed, (1,), replace(montecarlo.BUDGETS["standard"], pivot_mm=pivot_mm))
+        runs, truth = montecarlo.case(seed, Budget(pivot_mm=pivot_mm))
         return runs, truth
 
     return make
@@ -389,7 +390,7 @@ def test_a_skew_is_observable_with_a_known_pivot(monkeypatch: pytest.MonkeyPatch
         return made.model_copy(update={"unit": made.unit.model_copy(update={"accelerometer_skew_s": 3e-3})})
 
     monkeypatch.setattr(montecarlo, "scenario", skewed)
-    runs, truth = montecarlo.case(3, (1,), replace(montecarlo.BUDGETS["standard"], pivot_mm=0.0))
+    runs, truth = montecarlo.case(3, Budget(pivot_mm=0.0))
     found = estimate_joint(runs, Priors(skew=5e-3), pivot="fixed")
     skew = next(n for n in found.parameters if n.name == "skew_s")
     assert skew.observable
