@@ -80,6 +80,7 @@ def new_unit(
     pivot_fixed: bool = False,
     gravity_error: float = 0.0,
     set_down: float = 0.004,
+    wander: bool = False,
     changes: dict | None = None,
     rests: dict[int, list[dict]] | None = None,
 ) -> SimulatedUnit:
@@ -101,6 +102,8 @@ def new_unit(
         True less measured gravity, m/s^2.
     set_down : float
         How far a face leans from level, rad, 1 sigma.
+    wander : bool
+        Whether the biases wander, 5 ug and 0.005 deg/h with a time constant of 750 s, in steps of 20 s.
     changes : dict, optional
         Of the scenario, by its keys, `unit` added to that here.
     rests : dict of int to list of dict, optional
@@ -133,8 +136,26 @@ def new_unit(
     }
     for key, value in (changes or {}).items():
         document[key] = {**document.get(key, {}), **value} if isinstance(value, dict) else value
+    if wander:
+        document["unit"]["bias_steps"] = _wander(random, motion)
     scenario = parse(document, Scenario, "unit")
     return SimulatedUnit(scenario, draw_true_unit(scenario, layout))
+
+
+def _wander(random: np.random.Generator, motion: list[dict]) -> list[dict]:
+    """Return steps of a Gauss-Markov process."""
+    length = sum(next(iter(one.values()))["duration_s"] for one in motion)
+    kept = np.exp(-20.0 / 750.0)
+    sizes = np.repeat([0.005, 5.0], 3)
+    at, steps = sizes * random.standard_normal(6), []
+    change = at
+    for k in range(int(length // 20.0)):
+        steps.append(
+            {"at_s": 20.0 * k, "gyro_deg_per_h": change[:3].tolist(), "accelerometer_ug": change[3:].tolist()}
+        )
+        new = kept * at + np.sqrt(1.0 - kept**2) * sizes * random.standard_normal(6)
+        change, at = new - at, new
+    return steps
 
 
 def _certificate(random: np.random.Generator, scale: float) -> Calibration:

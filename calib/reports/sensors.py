@@ -141,7 +141,7 @@ def _gravity(result: SensorsResult) -> Iterator[Block]:
     ]
     adjustment = result.adjustment
     if adjustment is not None:
-        gyro, accelerometer = adjustment.wander
+        gyro, accelerometer, *_ = adjustment.wander
         rows += [
             ("wander", f"{gyro / DEG_PER_H:.4f} deg/h, {accelerometer / UG:.2f} ug from rest to rest"),
             (

@@ -6,7 +6,7 @@ contract, 3.6; the others are free of them, so that a start far from the truth l
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +49,10 @@ from imudrv.errors import InputError
 from imudrv.units import DEG_PER_H, MM, PPM, UG
 
 MOST_ITERATIONS: Final = 30
+LARGER_WANDER: Final = 2.0
+AT_CEILING: Final = 0.999
+CHI_SQUARE_95: Final = 3.84
+"""Wander at its ceiling is too large if twice as much explains the residuals significantly better."""
 WANDER_ITERATION: Final = 4
 """Iteration in which the size of the wander is found, near the end; it is kept from then on."""
 CONVERGED: Final = 1e-4
@@ -101,6 +105,15 @@ class Free:
         return np.concatenate([one[:, others], arms], axis=1)
 
 
+class Wander(NamedTuple):
+    """Size of the wander of the biases, rad/s and m/s^2, and whether it is larger than its ceiling."""
+
+    gyro: float
+    accelerometer: float
+    gyro_exceeds: bool = False
+    accelerometer_exceeds: bool = False
+
+
 @dataclass(frozen=True)
 class Adjustment:
     """Result of an adjustment.
@@ -121,8 +134,7 @@ class Adjustment:
         Covariance of the equations, wander included.
     chi_square : float
     degrees_of_freedom : int
-    wander : tuple of float
-        Of gyros, rad/s, and accelerometers, m/s^2.
+    wander : Wander
     iterations : int
     """
 
@@ -136,7 +148,7 @@ class Adjustment:
     V: Array
     chi_square: float
     degrees_of_freedom: int
-    wander: tuple[float, float]
+    wander: Wander
     iterations: int
 
     @property
@@ -182,7 +194,7 @@ def adjust(
     """
     site_gravity = p.gravity if site_gravity is None else site_gravity
     attitudes = list(attitudes)
-    wander = (0.0, 0.0)
+    wander = Wander(0.0, 0.0)
     Z = _whole_basis(free, len(attitudes))
     moved = np.zeros(Z.shape[1])
     for iteration in range(1, MOST_ITERATIONS + 1):
@@ -306,7 +318,7 @@ class _Solver:
         p: Parameters,
         site_gravity: float,
         gravity_sigma: float,
-        wander: tuple[float, float],
+        wander: Wander,
     ) -> None:
         self.Z = Z
         self.V = covariance_of(system, wander)
@@ -352,9 +364,10 @@ def _inverse(N: Array) -> Array:
     return inverse
 
 
-def covariance_of(system: LinearSystem, wander: tuple[float, float]) -> Array:
+def covariance_of(system: LinearSystem, wander: Wander) -> Array:
     """Return the covariance of the equations, wander included."""
-    V: Array = system.V + wander[0] ** 2 * system.wander[0] + wander[1] ** 2 * system.wander[1]
+    by_gyro, by_accelerometer = system.wander
+    V: Array = system.V + wander.gyro**2 * by_gyro + wander.accelerometer**2 * by_accelerometer
     return V
 
 
@@ -409,7 +422,7 @@ def _scale_and_axes(matrix: Array) -> tuple[Array, Array]:
 
 def _wander(
     system: LinearSystem, Z: Array, p: Parameters, site_gravity: float, gravity_sigma: float
-) -> tuple[float, float]:
+) -> Wander:
     """Return the size of the wander that the residuals show, below its ceiling (restricted likelihood)."""
     ceilings = np.array([GYRO_WANDER_CEILING, ACCELEROMETER_WANDER_CEILING])
     J = system.J @ Z
@@ -420,7 +433,7 @@ def _wander(
 
     def deviance(ratio: Array) -> float:
         sizes = ceilings * ratio
-        factor = cho_factor(covariance_of(system, (sizes[0], sizes[1])), lower=True)
+        factor = cho_factor(covariance_of(system, Wander(*sizes.tolist())), lower=True)
         weighted = cho_solve(factor, J)
         N = J.T @ weighted + prior
         scale = 1.0 / np.sqrt(np.diag(N))
@@ -432,8 +445,13 @@ def _wander(
 
     begin, bounds = np.array([0.2, 0.2]), [(0.0, 1.0)] * 2
     found = minimize(deviance, begin, bounds=bounds, method="L-BFGS-B", options={"ftol": 1e-5})
-    gyro, accelerometer = (ceilings * np.clip(found.x, 0.0, 1.0)).tolist()
-    return gyro, accelerometer
+    ratios = np.clip(found.x, 0.0, 1.0)
+    exceeds = []
+    for k in range(2):  # by a likelihood ratio: one rest more or less does not decide it
+        larger = ratios.copy()
+        larger[k] = LARGER_WANDER
+        exceeds.append(bool(ratios[k] > AT_CEILING and deviance(ratios) - deviance(larger) > CHI_SQUARE_95))
+    return Wander(*(ceilings * ratios).tolist(), *exceeds)
 
 
 def _result(
@@ -443,7 +461,7 @@ def _result(
     free: Free,
     site_gravity: float,
     gravity_sigma: float,
-    wander: tuple[float, float],
+    wander: Wander,
     iterations: int,
 ) -> Adjustment:
     system = equations.system(p, attitudes)

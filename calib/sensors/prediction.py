@@ -27,13 +27,18 @@ from imudrv.nav.earth import earth_rate_n
 from imudrv.records import Records
 from imudrv.sim.path import minimum_jerk
 from imudrv.site import Site
-from imudrv.units import ARCSEC, DEG_PER_SQRT_H, UG
+from imudrv.units import ARCSEC, DEG, DEG_PER_SQRT_H, UG
 
 TYPICAL_NOISE: Final = Noise(0.002 * DEG_PER_SQRT_H, 5 * UG)
 """Noise of a unit of the kind."""
 TYPICAL_SCALES: Final = NominalScales(0.5 * ARCSEC, 2000.0)
-MOTION_S: Final = 6.0
-"""Length of a motion by hand from rest to rest, s."""
+MOTION_S: Final = 4.0
+"""Length of a motion by hand, without the guards of the rests, s."""
+WOBBLE: Final = 1.5 * DEG
+_WOBBLE_HZ: Final = 1.3
+"""How a hand sways in a motion, about each axis: it shows the sensing points and the skew."""
+_SET_DOWN: Final = Rotation.from_rotvec([2e-3, -3e-3, 0.05]).as_matrix()
+"""How the unit stands in its poses: exactly level, hardly a pulse would come in a second."""
 _RATE_HZ: Final = 100.0
 _ROOM_DEGC: Final = 25.0
 
@@ -101,6 +106,7 @@ def predict_sensors(
     site: Site,
     rest_s: float = 60.0,
     motion_s: float = MOTION_S,
+    wobble: float = WOBBLE,
     free: Free | None = None,
     noise: Noise = TYPICAL_NOISE,
     nominal: NominalScales = TYPICAL_SCALES,
@@ -114,7 +120,9 @@ def predict_sensors(
     site : Site
         Place of the unit.
     rest_s, motion_s : float
-        Length of each rest and of each motion.
+        Length of each rest, and of each motion without the guards of the rests.
+    wobble : float
+        Amplitude by which the hand sways, rad; 0: a turntable.
     free : Free, optional
         Parameters to estimate.
     noise : Noise
@@ -127,7 +135,7 @@ def predict_sensors(
     SensorsPrediction
     """
     free = free or Free()
-    plan = _Plan(site, noise, nominal, rest_s, motion_s)
+    plan = _Plan(site, noise, nominal, rest_s, motion_s, wobble)
     reference = float(np.mean([pose.degc for session in sessions for pose in session]))
     return plan.shown(
         [
@@ -169,7 +177,7 @@ def additions(
     most : int
         Number of additions.
     """
-    plan = _Plan(site, noise, nominal, rest_s, MOTION_S)
+    plan = _Plan(site, noise, nominal, rest_s, MOTION_S, WOBBLE)
 
     def of(attitudes: Sequence[Array]) -> Array:
         return plan.information(attitudes, free, [_ROOM_DEGC] * len(attitudes), _ROOM_DEGC)
@@ -220,6 +228,7 @@ class _Plan(NamedTuple):
     nominal: NominalScales
     rest_s: float
     motion_s: float
+    wobble: float
 
     @property
     def start(self) -> Parameters:
@@ -232,12 +241,13 @@ class _Plan(NamedTuple):
     ) -> Array:
         """Return what the rests and motions of a session say of the parameters."""
         p = self.start
+        attitudes = [_SET_DOWN @ C for C in attitudes]
         rests = tuple(
             self._rest(k * (self.rest_s + self.motion_s), C, p, t)
             for k, (C, t) in enumerate(zip(attitudes, degc, strict=True))
         )
         links = tuple(
-            Link(k, k + 1, _turn(before, after, p, self.motion_s))
+            Link(k, k + 1, _turn(before, after, p, self.motion_s, self.wobble))
             for k, (before, after) in enumerate(pairwise(attitudes))
         )
         quanta = (
@@ -273,13 +283,17 @@ class _Plan(NamedTuple):
         return RestBins(0, 0, bins, at_s, 1.0, samples, sums, means, np.full(4, degc))
 
 
-def _turn(before: Array, after: Array, p: Parameters, duration_s: float) -> Records:
-    """Return the samples of a turn about one axis, without translation."""
-    n = round(duration_s * _RATE_HZ)
-    T = duration_s / n
+def _turn(before: Array, after: Array, p: Parameters, duration_s: float, wobble: float) -> Records:
+    """Return the samples of a turn about one axis that sways about all three, without translation."""
+    turning, guard = round(duration_s * _RATE_HZ), round(GUARD_S * _RATE_HZ)
+    n, T = turning + 2 * guard, 1.0 / _RATE_HZ
     whole = Rotation.from_matrix(after @ before.T).as_rotvec()
-    part = np.array([minimum_jerk(k / n)[0] for k in range(n + 1)])
-    in_n = Rotation.from_rotvec(np.outer(part, whole)).as_matrix() @ before
+    share = np.clip((np.arange(n + 1) - guard) / turning, 0.0, 1.0)
+    part = np.array([minimum_jerk(u)[0] for u in share.tolist()])
+    faded = np.sin(np.pi * part)[:, None] ** 2
+    phases = 2.0 * np.pi * (_WOBBLE_HZ * T * np.arange(n + 1)[:, None] + np.arange(3) / 3.0)
+    swaying = Rotation.from_rotvec(wobble * faded * np.sin(phases)).as_matrix()
+    in_n = Rotation.from_rotvec(np.outer(part, whole)).as_matrix() @ before @ swaying
     earth = Rotation.from_rotvec(np.outer(np.arange(n + 1) * T, p.omega_ie_n)).as_matrix()
     inertial = Rotation.from_matrix(earth @ in_n)
     samples = np.zeros(n, SAMPLE)

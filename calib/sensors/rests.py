@@ -49,6 +49,10 @@ class Noise:
     velocity_walk: float
 
 
+LEAST_NOISE: Final = Noise(1e-7, 1e-5)
+"""Least noise that is believed, 0.0003 deg/sqrt(h) and 1 ug/sqrt(Hz); the integration errs by less."""
+
+
 @dataclass(frozen=True)
 class RestBins:
     """A rest: sums of its increments at nominal scale over bins of a second.
@@ -566,7 +570,7 @@ def rest_noise(rests: Sequence[RestBins]) -> Noise:
             continue
         walk = (variance[-1] - variance[0]) / (2.0 * (lags[-1] - lags[0]) * bin_s)
         walks.append(sqrt(max(float(walk), 0.0)))
-    return Noise(*walks)
+    return Noise(max(walks[0], LEAST_NOISE.angle_walk), max(walks[1], LEAST_NOISE.velocity_walk))
 
 
 _LAGS: Final = (1, 6)

@@ -23,7 +23,6 @@ SCALE_LIMIT: Final = 0.2
 """Largest deviation of a scale from nominal."""
 TEMPERATURE_K: Final = 1.0
 """Largest change of temperature that is not mentioned."""
-AT_CEILING: Final = 0.999
 
 
 def judge(
@@ -62,13 +61,12 @@ def judge(
 
 
 def _wander(adjustment: Adjustment) -> Iterator[Judgement]:
-    gyro, accelerometer = adjustment.wander
-    if gyro > AT_CEILING * GYRO_WANDER_CEILING:
+    if adjustment.wander.gyro_exceeds:
         yield Judgement(
             "caution",
             f"The biases of the gyros wander by more than {GYRO_WANDER_CEILING / DEG_PER_H:g} deg/h.",
         )
-    if accelerometer > AT_CEILING * ACCELEROMETER_WANDER_CEILING:
+    if adjustment.wander.accelerometer_exceeds:
         yield Judgement(
             "caution",
             "The biases of the accelerometers wander by more than "
