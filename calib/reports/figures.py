@@ -262,9 +262,9 @@ def allan_deviations(tau_s: Array, channels: Sequence[ChannelNoise], unit: str, 
     bytes
         SVG.
     """
-    with _drawing(2.6) as (figure, svg):
+    with drawing(2.6) as (figure, svg):
         panels = figure.subplots(1, len(channels), sharey=True)
-        for axes, channel, colour in zip(panels, channels, _COLOURS, strict=True):
+        for axes, channel, colour in zip(panels, channels, COLOURS, strict=True):
             fit, deviation = channel.fit, channel.deviation / si
             axes.loglog(tau_s, deviation, ".", color=_GREY, markersize=2)
             at = np.searchsorted(tau_s, fit.tau_s)

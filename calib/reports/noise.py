@@ -15,8 +15,8 @@ _NOTE = (
     "divided by sqrt(2). Uncertainties are standard ones; < is an upper limit (95 %) of what is not observed."
 )
 _LIMITS = (
-    "95 %, and for any data: no other noise makes a deviation smaller. In brackets: averaging time. That of Q "
-    "is for an error of the pulse count that is white at that time."
+    "95 %, and for any data: no other noise makes a deviation smaller. In brackets: averaging time. That of "
+    "Q is for an error of the pulse count that is white at that time."
 )
 
 
