@@ -79,8 +79,10 @@ def new_unit(
     scale: float = 0.005,
     pivot_fixed: bool = False,
     gravity_error: float = 0.0,
+    set_down: float = 0.004,
+    wander: bool = False,
     changes: dict | None = None,
-    straight: bool = False,
+    rests: dict[int, list[dict]] | None = None,
 ) -> SimulatedUnit:
     """Return a unit and its session by hand.
 
@@ -98,24 +100,28 @@ def new_unit(
         On a table: the origin of b stays where it is.
     gravity_error : float
         True less measured gravity, m/s^2.
+    set_down : float
+        How far a face leans from level, rad, 1 sigma.
+    wander : bool
+        Whether the biases wander, 5 ug and 0.005 deg/h with a time constant of 750 s, in steps of 20 s.
     changes : dict, optional
         Of the scenario, by its keys, `unit` added to that here.
-    straight : bool
-        Poses without error.
+    rests : dict of int to list of dict, optional
+        Motions in the place of a rest, by its number from 0.
     """
     random = np.random.default_rng(seed)
     attitudes = six_faces_turned() if attitudes is None else attitudes
     calibration = _certificate(random, scale)
     site = SITE.model_copy(update={"gravity_m_s2": SITE.gravity + gravity_error})
     motion: list[dict] = []
-    C = attitudes[0]
+    C = np.eye(3)
     for k, wanted in enumerate(attitudes):
-        if k:
-            error = np.zeros(3) if straight else random.normal(0.0, [0.004, 0.004, 0.05])
-            target = rotation(error, float(np.linalg.norm(error))) @ wanted if error.any() else wanted
+        if k or not np.array_equal(wanted, C):
+            error = random.normal(0.0, [set_down, set_down, 0.05])
+            target = rotation(error, float(np.linalg.norm(error))) @ wanted
             motion += _carry(C, target, random, pivot_fixed)
             C = target
-        motion.append({"rest": {"duration_s": rest_s}})
+        motion += (rests or {}).get(k, [{"rest": {"duration_s": rest_s}}])
     document = {
         "format": "imu50-scenario",
         "version": 1,
@@ -130,8 +136,26 @@ def new_unit(
     }
     for key, value in (changes or {}).items():
         document[key] = {**document.get(key, {}), **value} if isinstance(value, dict) else value
+    if wander:
+        document["unit"]["bias_steps"] = _wander(random, motion)
     scenario = parse(document, Scenario, "unit")
     return SimulatedUnit(scenario, draw_true_unit(scenario, layout))
+
+
+def _wander(random: np.random.Generator, motion: list[dict]) -> list[dict]:
+    """Return steps of a Gauss-Markov process."""
+    length = sum(next(iter(one.values()))["duration_s"] for one in motion)
+    kept = np.exp(-20.0 / 750.0)
+    sizes = np.repeat([0.005, 5.0], 3)
+    at, steps = sizes * random.standard_normal(6), []
+    change = at
+    for k in range(int(length // 20.0)):
+        steps.append(
+            {"at_s": 20.0 * k, "gyro_deg_per_h": change[:3].tolist(), "accelerometer_ug": change[3:].tolist()}
+        )
+        new = kept * at + np.sqrt(1.0 - kept**2) * sizes * random.standard_normal(6)
+        change, at = new - at, new
+    return steps
 
 
 def _certificate(random: np.random.Generator, scale: float) -> Calibration:

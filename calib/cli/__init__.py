@@ -3,6 +3,7 @@
 A module is imported when its command is called, see `imudrv.terminal.run_program`.
 """
 
+import os
 from collections.abc import Sequence
 from typing import Final
 
@@ -35,4 +36,6 @@ COMMANDS: Final = {
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `calib` with some arguments, those of the process if None; return the exit code."""
+    # numpy comes later: threads make matrices of a few hundred rows slower, much so on a busy machine
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     return run_program(__name__, "Inner lever arms of a 50-type ring-laser-gyro IMU.", COMMANDS, argv)

@@ -28,8 +28,8 @@ def document(result: SensorsResult) -> Document:
         Section("Rests and motions", tuple(_rests(result))),
         Section("Gravity and noise", tuple(_gravity(result))),
     ]
-    if result.adjustment is not None:
-        sections.append(Section("Details", tuple(_details(result))))
+    if details := tuple(_details(result)):
+        sections.append(Section("Details", details))
     return Document(
         f"Sensors of unit {sanitise(result.inputs.serial_number)}",
         f"Calibration of {result.created:%Y-%m-%d %H:%M} UTC, {software()}",
@@ -50,20 +50,12 @@ def _parameters(result: SensorsResult) -> Iterator[Block]:
     yield Table(
         "Numbers of the certificate",
         ("", "value", "u", "U", "observable", "before"),
-        tuple(_row(one) for one in result.estimates if shown(one)),
+        tuple(_row(one) for one in result.estimates if one.is_shown),
     )
     if result.missing:
         yield KeyValues(tuple(("to add", sanitise(text)) for text in result.missing))
     if refusal := why_none(result):
         yield Paragraph(f"No certificate: {sanitise(refusal)}")
-
-
-def shown(one: Estimate) -> bool:
-    """Return whether a number is in the table: not what a gauge or a length of 1 fixes."""
-    if ".C_" not in one.path:
-        return True
-    row, column = one.path[-5], one.path[-2]
-    return row != column and (one.sigma > 0.0 or one.value != 0.0) and one.sigma > 1e-12
 
 
 def _row(one: Estimate) -> tuple[str, ...]:
@@ -120,6 +112,15 @@ def _rests(result: SensorsResult) -> Iterator[Block]:
                 for one in evidence.left
             )
         )
+    if adjustment is not None:
+        yield Figure("Residuals of rests and motions, in sigma", partial(figures.residuals, result))
+        yield Figure(
+            "Direction of up in body axes at each rest, in order", partial(figures.attitudes, result)
+        )
+    if any(np.isfinite(rest.degc).any() for rest in evidence.rests):
+        yield Figure("Temperature of the rests, degC", partial(figures.temperatures, result))
+    if not evidence.links:
+        return
     yield Paragraph(
         f"The fastest motion turned a gyro at {evidence.fastest / DEG:.0f} deg/s. Scale and bias of a laser "
         "gyro depend on the rate: the numbers hold up to there."
@@ -140,7 +141,7 @@ def _gravity(result: SensorsResult) -> Iterator[Block]:
     ]
     adjustment = result.adjustment
     if adjustment is not None:
-        gyro, accelerometer = adjustment.wander
+        gyro, accelerometer, *_ = adjustment.wander
         rows += [
             ("wander", f"{gyro / DEG_PER_H:.4f} deg/h, {accelerometer / UG:.2f} ug from rest to rest"),
             (
@@ -180,20 +181,12 @@ def _details(result: SensorsResult) -> Iterator[Block]:
                 for name, d in result.faces.squareness.items()
             ),
         )
-    yield Figure(
-        "Residuals of rests and motions, in sigma",
-        partial(figures.residuals, result),
-    )
-    yield Figure("Direction of up in body axes at each rest, in order", partial(figures.attitudes, result))
-    degc = np.array([rest.degc for rest in result.evidence.rests])
-    if np.isfinite(degc).any():
-        yield Figure("Temperature of the rests, degC", partial(figures.temperatures, result))
 
 
 def _correlations(result: SensorsResult) -> Iterator[tuple[str, str, str]]:
     C = result.covariance
     sigma = np.sqrt(np.maximum(np.diag(C), 0.0))
-    rows = [k for k, one in enumerate(result.estimates) if shown(one) and one.observable and sigma[k] > 0.0]
+    rows = [k for k, one in enumerate(result.estimates) if one.is_shown and one.observable and sigma[k] > 0.0]
     for i, a in enumerate(rows):
         for b in rows[:i]:
             if abs(correlation := C[a, b] / (sigma[a] * sigma[b])) > CORRELATED:

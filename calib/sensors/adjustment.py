@@ -1,15 +1,16 @@
 """The adjustment: Gauss-Newton on all parameters and attitudes, and the size of the wander.
 
-What the equations do not show stays where it started: each step is damped by the priors of the contract, 3.6,
-about the present point, not about the start, so that a start far from the truth leaves nothing in the result.
+Directions of the parameters that the equations do not show are held at the start by the priors of the
+contract, 3.6; the others are free of them, so that a start far from the truth leaves nothing in the result.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve, eigh
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
@@ -20,6 +21,7 @@ from calib.sensors.equations import (
     Equations,
     LinearSystem,
 )
+from calib.sensors.observability import RATIO
 from calib.sensors.parameters import (
     ACCELEROMETER_SCALE_PRIOR,
     ACCELEROMETER_SCALE_T,
@@ -47,10 +49,19 @@ from imudrv.errors import InputError
 from imudrv.units import DEG_PER_H, MM, PPM, UG
 
 MOST_ITERATIONS: Final = 30
-WANDER_ITERATIONS: Final = (3, 4, 5)
-"""Iterations in which the size of the wander is found; it is kept from then on."""
+LARGER_WANDER: Final = 2.0
+AT_CEILING: Final = 0.999
+CHI_SQUARE_95: Final = 3.84
+"""Wander at its ceiling is too large if twice as much explains the residuals significantly better."""
+WANDER_ITERATION: Final = 4
+"""Iteration in which the size of the wander is found, near the end; it is kept from then on."""
 CONVERGED: Final = 1e-4
 """Largest step of a parameter, in its sigma, at which the iteration ends."""
+
+
+MEASURED_GRAVITY: Final = 1e-5
+NORMAL_GRAVITY: Final = 50e-5
+"""Uncertainty of gravity that was measured, and of normal gravity, m/s^2."""
 
 
 @dataclass(frozen=True)
@@ -94,6 +105,15 @@ class Free:
         return np.concatenate([one[:, others], arms], axis=1)
 
 
+class Wander(NamedTuple):
+    """Size of the wander of the biases, rad/s and m/s^2, and whether it is larger than its ceiling."""
+
+    gyro: float
+    accelerometer: float
+    gyro_exceeds: bool = False
+    accelerometer_exceeds: bool = False
+
+
 @dataclass(frozen=True)
 class Adjustment:
     """Result of an adjustment.
@@ -114,8 +134,7 @@ class Adjustment:
         Covariance of the equations, wander included.
     chi_square : float
     degrees_of_freedom : int
-    wander : tuple of float
-        Of gyros, rad/s, and accelerometers, m/s^2.
+    wander : Wander
     iterations : int
     """
 
@@ -129,7 +148,7 @@ class Adjustment:
     V: Array
     chi_square: float
     degrees_of_freedom: int
-    wander: tuple[float, float]
+    wander: Wander
     iterations: int
 
     @property
@@ -175,27 +194,104 @@ def adjust(
     """
     site_gravity = p.gravity if site_gravity is None else site_gravity
     attitudes = list(attitudes)
-    wander = (0.0, 0.0)
+    wander = Wander(0.0, 0.0)
+    Z = _whole_basis(free, len(attitudes))
+    moved = np.zeros(Z.shape[1])
     for iteration in range(1, MOST_ITERATIONS + 1):
         system = equations.system(p, attitudes)
         if not np.isfinite(system.residual).all():
             raise NoConvergence("the adjustment does not converge: its numbers grow without bounds")
-        Z = _whole_basis(free, len(attitudes))
-        settled = iteration > WANDER_ITERATIONS[-1]
-        if iteration in WANDER_ITERATIONS:
+        settled = iteration > WANDER_ITERATION
+        if iteration == WANDER_ITERATION:
             wander = _wander(system, Z, p, site_gravity, gravity_sigma)
         solver = _Solver(system, Z, p, site_gravity, gravity_sigma, wander)
-        step, sigma = solver.step()
-        p = p.moved(step[:COLUMNS])
-        for k, psi in enumerate(step[COLUMNS:].reshape(-1, 3)):
+        step = solver.step(moved)
+        moved = moved + step
+        whole = Z @ step
+        p = p.moved(whole[:COLUMNS])
+        for k, psi in enumerate(whole[COLUMNS:].reshape(-1, 3)):
             attitudes[k] = Rotation.from_rotvec(psi).as_matrix() @ attitudes[k]
-        largest = float(np.max(np.abs(solver.reduced_step) / sigma))
+        largest = float(np.max(np.abs(step) / np.sqrt(np.diag(solver.covariance))))
         if settled and largest < CONVERGED:
             return _result(equations, p, attitudes, free, site_gravity, gravity_sigma, wander, iteration)
     raise NoConvergence(
         f"the adjustment does not converge: after {MOST_ITERATIONS} iterations a parameter still moves by "
         f"{largest:.2g} of its sigma"
     )
+
+
+def information(system: LinearSystem, rests: int, free: Free) -> Array:
+    """Return what a system says of the free parameters, whatever the attitudes.
+
+    Parameters
+    ----------
+    system : LinearSystem
+    rests : int
+        Number of rests.
+    free : Free
+
+    Returns
+    -------
+    ndarray, shape (n, n)
+        By the columns of `Free.basis`. That of independent systems adds up.
+    """
+    n = free.basis.shape[1]
+    J = system.J @ _whole_basis(free, rests)
+    N = J.T @ cho_solve(cho_factor(system.V, lower=True), J)
+    reduced: Array = N[:n, :n] - N[:n, n:] @ np.linalg.solve(N[n:, n:], N[n:, :n])
+    return reduced
+
+
+def posterior(information: Array, p: Parameters, free: Free, gravity_sigma: float) -> tuple[Array, Array]:
+    """Return the covariance of the free parameters with their priors, and that of the priors alone."""
+    prior = prior_information(p)
+    prior[GRAVITY, GRAVITY] += 1.0 / gravity_sigma**2
+    own = free.basis.T @ prior @ free.basis
+    return _inverse(information + own), _inverse(own)
+
+
+def leave_one_out(found: Adjustment, free: Free, gravity_sigma: float) -> tuple[float, ...]:
+    """Return for each rest by how much the sigma of a parameter grows at most without it and its motions."""
+    system, rests = found.system, len(found.attitudes)
+    attitudes = system.J[:, COLUMNS:].reshape(-1, rests, 3)
+
+    def sigma(kept: NDArray[np.bool_], without: list[int]) -> Array:
+        J = np.delete(system.J[kept], [COLUMNS + 3 * k + i for k in without for i in range(3)], axis=1)
+        part = replace(system, J=J, V=found.V[np.ix_(kept, kept)])
+        P, _ = posterior(information(part, rests - len(without), free), found.p, free, gravity_sigma)
+        return np.sqrt(np.diag(P))
+
+    whole = sigma(np.ones(len(attitudes), np.bool_), [])
+    growths = []
+    for k in range(rests):
+        kept = np.ones(len(attitudes), np.bool_)
+        for block in system.blocks:
+            kept[block.rows] = not attitudes[block.rows, k].any()
+        growths.append(float((sigma(kept, [k]) / whole).max()))
+    return tuple(growths)
+
+
+def earth_rate_shift(found: Adjustment, free: Free, gravity_sigma: float) -> tuple[Array, Array]:
+    """Return by how much the equations would move the Earth rate north and up, and its covariance.
+
+    Parameters
+    ----------
+    found : Adjustment
+        Converged, the Earth rate that of the site.
+    free : Free
+        Its free parameters.
+    gravity_sigma : float
+        As in `adjust`.
+
+    Returns
+    -------
+    tuple of ndarray, shape (2,), and ndarray, shape (2, 2)
+        rad/s.
+    """
+    Z = _whole_basis(replace(free, earth=True), len(found.attitudes))
+    solver = _Solver(found.system, Z, found.p, found.p.gravity, gravity_sigma, found.wander)
+    covariance = Z @ solver.covariance @ Z.T
+    return (Z @ solver.step(np.zeros(Z.shape[1])))[EARTH], covariance[EARTH, EARTH]
 
 
 def _whole_basis(free: Free, rests: int) -> Array:
@@ -207,7 +303,13 @@ def _whole_basis(free: Free, rests: int) -> Array:
 
 
 class _Solver:
-    """One step of the iteration, and its covariance."""
+    """One step of the iteration, and its covariance.
+
+    Attributes
+    ----------
+    covariance : ndarray, shape (n, n)
+        Of what is free, with the priors of the parameters.
+    """
 
     def __init__(
         self,
@@ -216,32 +318,56 @@ class _Solver:
         p: Parameters,
         site_gravity: float,
         gravity_sigma: float,
-        wander: tuple[float, float],
+        wander: Wander,
     ) -> None:
         self.Z = Z
         self.V = covariance_of(system, wander)
         self.J = system.J @ Z
-        factor = cho_factor(self.V, lower=True)
-        weighted = cho_solve(factor, self.J)
-        at_gravity = np.zeros(len(Z))
-        at_gravity[GRAVITY] = 1.0 / gravity_sigma
-        row = at_gravity @ Z
-        damping = np.zeros((len(Z), len(Z)))
-        damping[:COLUMNS, :COLUMNS] = prior_information(p)
-        N = self.J.T @ weighted + np.outer(row, row) + Z.T @ damping @ Z
-        rhs = weighted.T @ system.residual + row * (p.gravity - site_gravity) / gravity_sigma
-        scale = 1.0 / np.sqrt(np.diag(N))
-        self.covariance = np.linalg.inv(N * scale * scale[:, None]) * scale * scale[:, None]
-        self.reduced_step = -self.covariance @ rhs
+        weighted = cho_solve(cho_factor(self.V, lower=True), self.J)
+        gravity = Z[GRAVITY.start] / gravity_sigma
+        self._N = self.J.T @ weighted + np.outer(gravity, gravity)
+        self._gradient = weighted.T @ system.residual + gravity * (p.gravity - site_gravity) / gravity_sigma
+        self._n = int(np.count_nonzero(np.any(Z[:COLUMNS] != 0.0, axis=0)))  # parameters; then attitudes
+        basis = Z[:COLUMNS, : self._n]
+        self._prior = basis.T @ prior_information(p) @ basis
+        whole = self._N.copy()
+        whole[: self._n, : self._n] += self._prior
+        self.covariance = _inverse(whole)
 
-    def step(self) -> tuple[Array, Array]:
-        """Return the step of parameters and attitudes, and the sigma of what is free."""
-        return self.Z @ self.reduced_step, np.sqrt(np.diag(self.covariance))
+    def step(self, moved: Array) -> Array:
+        """Return the step of what is free.
+
+        What is observable goes where the equations say. What is not is held by its prior at the start.
+
+        Parameters
+        ----------
+        moved : ndarray, shape (n,)
+            Sum of the steps before this one.
+        """
+        n, N, g = self._n, self._N, self._gradient
+        by_attitude = np.linalg.solve(N[n:, n:], np.concatenate([N[n:, :n], g[n:, None]], axis=1))
+        own = N[:n, :n] - N[:n, n:] @ by_attitude[:, :n]
+        gradient = g[:n] - N[:n, n:] @ by_attitude[:, n]
+        prior = self._prior + 1e-6 * np.diag(np.diag(own))
+        ratio, directions = eigh(0.5 * (own + own.T), prior)
+        held = ratio < 1.0 / RATIO**2 - 1.0
+        pull = directions.T @ gradient + held * (directions.T @ (prior @ moved[:n]))
+        parameters = -directions @ (pull / (ratio + held))
+        attitudes = -(by_attitude[:, n] + by_attitude[:, :n] @ parameters)
+        return np.concatenate([parameters, attitudes])
 
 
-def covariance_of(system: LinearSystem, wander: tuple[float, float]) -> Array:
+def _inverse(N: Array) -> Array:
+    """Return the inverse of a positive definite matrix of numbers of different size."""
+    scale = 1.0 / np.sqrt(np.diag(N))
+    inverse: Array = np.linalg.inv(N * scale * scale[:, None]) * scale * scale[:, None]
+    return inverse
+
+
+def covariance_of(system: LinearSystem, wander: Wander) -> Array:
     """Return the covariance of the equations, wander included."""
-    V: Array = system.V + wander[0] ** 2 * system.wander[0] + wander[1] ** 2 * system.wander[1]
+    by_gyro, by_accelerometer = system.wander
+    V: Array = system.V + wander.gyro**2 * by_gyro + wander.accelerometer**2 * by_accelerometer
     return V
 
 
@@ -296,7 +422,7 @@ def _scale_and_axes(matrix: Array) -> tuple[Array, Array]:
 
 def _wander(
     system: LinearSystem, Z: Array, p: Parameters, site_gravity: float, gravity_sigma: float
-) -> tuple[float, float]:
+) -> Wander:
     """Return the size of the wander that the residuals show, below its ceiling (restricted likelihood)."""
     ceilings = np.array([GYRO_WANDER_CEILING, ACCELEROMETER_WANDER_CEILING])
     J = system.J @ Z
@@ -307,7 +433,7 @@ def _wander(
 
     def deviance(ratio: Array) -> float:
         sizes = ceilings * ratio
-        factor = cho_factor(covariance_of(system, (sizes[0], sizes[1])), lower=True)
+        factor = cho_factor(covariance_of(system, Wander(*sizes.tolist())), lower=True)
         weighted = cho_solve(factor, J)
         N = J.T @ weighted + prior
         scale = 1.0 / np.sqrt(np.diag(N))
@@ -317,9 +443,15 @@ def _wander(
         logs = np.log(np.diag(factor[0])).sum() + np.log(np.diag(inner[0])).sum() - np.log(scale).sum()
         return float(2.0 * logs + system.residual @ cho_solve(factor, system.residual) - fitted)
 
-    found = minimize(deviance, np.array([0.2, 0.2]), bounds=[(0.0, 1.0)] * 2, method="L-BFGS-B")
-    gyro, accelerometer = (ceilings * np.clip(found.x, 0.0, 1.0)).tolist()
-    return gyro, accelerometer
+    begin, bounds = np.array([0.2, 0.2]), [(0.0, 1.0)] * 2
+    found = minimize(deviance, begin, bounds=bounds, method="L-BFGS-B", options={"ftol": 1e-5})
+    ratios = np.clip(found.x, 0.0, 1.0)
+    exceeds = []
+    for k in range(2):  # by a likelihood ratio: one rest more or less does not decide it
+        larger = ratios.copy()
+        larger[k] = LARGER_WANDER
+        exceeds.append(bool(ratios[k] > AT_CEILING and deviance(ratios) - deviance(larger) > CHI_SQUARE_95))
+    return Wander(*(ceilings * ratios).tolist(), *exceeds)
 
 
 def _result(
@@ -329,7 +461,7 @@ def _result(
     free: Free,
     site_gravity: float,
     gravity_sigma: float,
-    wander: tuple[float, float],
+    wander: Wander,
     iterations: int,
 ) -> Adjustment:
     system = equations.system(p, attitudes)

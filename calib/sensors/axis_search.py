@@ -98,17 +98,16 @@ def _explanations(S: Array, sense: float) -> list[tuple[int, str]]:
         found.append(_described("accelerometer", S))
     gyros = sense * np.linalg.det(S) * S.T
     found.append(_described("gyro", gyros))
-    if sense < 0.0 and np.array_equal(S, np.eye(3)):
-        found = [
-            (4, "the axes are left-handed: all gyros, or one axis of gyros and accelerometers, reversed")
-        ]
+    if sense < 0.0 and abs(np.trace(S)) == 3.0:
+        text = "the axes are left-handed: write sign: -1 for one axis of gyros and accelerometers both"
+        found = [(0, f"{text}, or for all gyros, in the profile")]
     return found
 
 
 def _described(sensor: str, S: Array) -> tuple[int, str]:
     changed = [k for k in range(3) if S[k, k] != 1.0]
     reversed_ = [k for k in changed if S[k, k] == -1.0]
-    names = " and ".join("XYZ"[k] for k in changed)
+    names = ", ".join("XYZ"[k] for k in changed[:-1]) + " and " * (len(changed) > 1) + "XYZ"[changed[-1]]
     several = "s" if len(changed) > 1 else ""
     if len(reversed_) == len(changed):
         is_are = "are" if several else "is"

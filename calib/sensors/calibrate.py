@@ -9,30 +9,38 @@ from pathlib import Path
 from typing import Final, Literal
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 
 from calib.inputs import StrPath, profile_of, require_six_axes, site_of
 from calib.procedure.schema import Procedure
-from calib.sensors.adjustment import Adjustment, Free, NoConvergence, adjust, prior_information
+from calib.sensors.adjustment import (
+    MEASURED_GRAVITY,
+    NORMAL_GRAVITY,
+    Adjustment,
+    Free,
+    NoConvergence,
+    adjust,
+    earth_rate_shift,
+    leave_one_out,
+)
 from calib.sensors.axis_search import find_exchange, measured_latitude, scale_faults, wrong_hemisphere
 from calib.sensors.equations import Equations, start_attitudes
 from calib.sensors.faces import find_faces
 from calib.sensors.parameters import (
-    COLUMNS,
     EARTH,
-    GRAVITY,
     Nonlinearity,
     Parameters,
     nominal_scales,
     start_parameters,
 )
-from calib.sensors.rests import Evidence, read_evidence
+from calib.sensors.prediction import additions
+from calib.sensors.rests import GUARD_S, Evidence, read_evidence
 from calib.sensors.result import CaptureInput, Judgement, SensorsInput, SensorsResult, pose_of
 from calib.sensors.verdict import (
     REDUCED_BAD,
     SCALE_LIMIT,
     earth_judgement,
     gravity_judgement,
+    grouped,
     judge,
     lacks_mandatory,
     scale_text,
@@ -48,9 +56,6 @@ from imudrv.profiles.schema import Profile
 from imudrv.records import Records
 from imudrv.site import Site
 
-MEASURED_GRAVITY: Final = 1e-5
-NORMAL_GRAVITY: Final = 50e-5
-"""Uncertainty of gravity that was measured, and of normal gravity, m/s^2."""
 EARTH_SIGMAS: Final = 5.0
 """Difference of the Earth rate from that of the site that is believed."""
 
@@ -142,10 +147,16 @@ def calibrate_sensors(
         )
     paths = list(map(Path, captures))
     with ExitStack() as files:
-        inputs: list[CaptureInput] = []
-        readers, opened = [], []
+        readers: list[partial[Iterator[Records]]] = []
+        opened: list[Capture] = []
+        digests: list[str] = []
         for path in paths:
             files.enter_context(unchanged(path))
+            digest = sha256(path)
+            if digest in digests:
+                other = paths[digests.index(digest)].name
+                raise InputError(f"{path}: expected another capture, got that of {other} once more")
+            digests.append(digest)
             capture = Capture(path, profile_of(profile), channel)
             opened.append(capture)
             readers.append(partial(_pulses, capture, advance))
@@ -163,11 +174,10 @@ def calibrate_sensors(
                 "in the profile, or give --start"
             )
         evidence = read_evidence(readers, layout, nominal)
-        for path, capture in zip(paths, opened, strict=True):
-            digest = sha256(path)
-            if digest in [one.sha256 for one in inputs]:
-                raise InputError(f"{path}: expected another capture, got one twice")
-            inputs.append(CaptureInput(path.name, digest, str(capture.tracker.counts)))
+        inputs = [
+            CaptureInput(path.name, digest, str(capture.tracker.counts))
+            for path, digest, capture in zip(paths, digests, opened, strict=True)
+        ]
     given = SensorsInput(
         unit,
         layout.name,
@@ -219,9 +229,11 @@ def solve(
     try:
         found, extra = _adjust(equations, p, attitudes, options.free, gravity_sigma, site)
     except NoConvergence as error:
+        if options.free.fixed_pivot:
+            _require_fixed_pivot(evidence, p, attitudes, options.free, gravity_sigma, reference)
         return failed(poses, (Judgement("bad", f"{error}. No certificate is made."),))
     if options.free.fixed_pivot and found.reduced > REDUCED_BAD:
-        _require_fixed_pivot(evidence, found, options.free, gravity_sigma, site.gravity, reference)
+        _require_fixed_pivot(evidence, p, attitudes, options.free, gravity_sigma, reference)
     faces = find_faces(found.attitudes) if options.frame == "faces" else None
     result = SensorsResult(
         inputs,
@@ -241,6 +253,8 @@ def solve(
         *gravity_judgement(site, gravity_sigma),
         *temperature_judgement(evidence, options.temperature),
     ]
+    if result.not_observable and not any(one.mark == "bad" for one in verdict):
+        result = replace(result, missing=tuple(_missing(result)))
     lacking = lacks_mandatory(result.estimates)
     if lacking and inputs.start is None:
         verdict.append(
@@ -251,6 +265,28 @@ def solve(
             )
         )
     return replace(result, verdict=tuple(verdict))
+
+
+def _missing(result: SensorsResult) -> Iterator[str]:
+    """Yield the motions to add, each with what it would show."""
+    adjustment, inputs, evidence = result.adjustment, result.inputs, result.evidence
+    if adjustment is None:
+        return
+    linked = {link.after for link in evidence.links}
+    sessions: list[list[Array]] = []
+    for k, C_nb in enumerate(adjustment.attitudes):
+        if k in linked:
+            sessions[-1].append(C_nb)
+        else:
+            sessions.append([C_nb])
+    rest_s = float(np.mean([rest.duration_s for rest in evidence.rests])) + 2.0 * GUARD_S
+    lacking = [path for path in result.not_observable if not path.startswith("temperature")]
+    for text, paths in additions(
+        sessions, lacking, site=inputs.site, rest_s=rest_s, free=replace(inputs.free, temperature=False)
+    ):
+        yield f"{text}: shows {', '.join(grouped(paths))}"
+    if len(lacking) < len(result.not_observable):
+        yield "the same while the unit warms up by 10 K: shows the slopes per kelvin"
 
 
 def _reference(evidence: Evidence) -> float:
@@ -278,47 +314,50 @@ def _adjust(
     site: Site,
 ) -> tuple[Adjustment, list[Judgement]]:
     """Adjust; with a free Earth rate where that of the site is refuted."""
+    from_p, from_attitudes = p, tuple(attitudes)
     try:
         found = adjust(equations, p, attitudes, free, gravity_sigma)
-        from_p, from_attitudes = found.p, found.attitudes
     except NoConvergence:
-        found, from_p, from_attitudes = None, p, tuple(attitudes)
+        pass
+    else:
+        shift, P = earth_rate_shift(found, free, gravity_sigma)
+        if shift @ np.linalg.solve(P, shift) < EARTH_SIGMAS**2:
+            return found, []
+        from_p, from_attitudes = found.p, found.attitudes
     measured = adjust(
         equations, from_p, from_attitudes, replace(free, earth=True), gravity_sigma, site.gravity
     )
     difference = measured.p.earth - np.array(earth_rate_n(site.latitude_rad)[1:])
     P = measured.covariance[EARTH, EARTH] * max(1.0, measured.reduced)
     sigmas = float(np.sqrt(difference @ np.linalg.solve(P, difference)))
-    if found is not None and sigmas < EARTH_SIGMAS:
+    if from_p is not p and sigmas < EARTH_SIGMAS:  # the Earth rate explains nothing
         return found, []
     return measured, [earth_judgement(site, measured.p.earth, sigmas)]
 
 
 def _require_fixed_pivot(
     evidence: Evidence,
-    found: Adjustment,
+    p: Parameters,
+    attitudes: Sequence[Array],
     free: Free,
     gravity_sigma: float,
-    site_gravity: float,
     reference: float,
 ) -> None:
     """Refuse a fixed pivot where the rest of the equations agrees without it."""
     try:
         without = adjust(
             Equations(evidence, reference, False),
-            found.p,
-            found.attitudes,
+            p,
+            attitudes,
             replace(free, fixed_pivot=False),
             gravity_sigma,
-            site_gravity,
         )
     except NoConvergence:
         return
     if without.reduced < REDUCED_BAD:
         raise InputError(
             "--pivot fixed: expected an origin of the body axes that stays where it is, got displacements "
-            f"that contradict it (reduced chi-square {found.reduced:.1f}, {without.reduced:.1f} without); "
-            "use --pivot free"
+            f"that contradict it (reduced chi-square without it {without.reduced:.2f}); use --pivot free"
         )
 
 
@@ -345,33 +384,3 @@ NEAR_POSE: Final = radians(46.0)
 def angle(C: Array) -> float:
     """Return the angle of a rotation, rad."""
     return float(np.arccos(np.clip((np.trace(C) - 1.0) / 2.0, -1.0, 1.0)))
-
-
-def leave_one_out(found: Adjustment, free: Free, gravity_sigma: float) -> tuple[float, ...]:
-    """Return for each rest by how much the sigma of a parameter grows at most without it and its motions."""
-    system, K = found.system, len(found.attitudes)
-    basis = free.basis
-    m = basis.shape[1]
-    Z = np.zeros((COLUMNS + 3 * K, m + 3 * K))
-    Z[:COLUMNS, :m], Z[COLUMNS:, m:] = basis, np.eye(3 * K)
-    J = system.J @ Z
-    damping = np.zeros((COLUMNS, COLUMNS)) + prior_information(found.p)
-    damping[GRAVITY, GRAVITY] += 1.0 / gravity_sigma**2
-    prior = np.zeros((m + 3 * K, m + 3 * K))
-    prior[:m, :m] = basis.T @ damping @ basis
-    prior[m:, m:] = np.eye(3 * K)  # an attitude of no equation
-    motion_psi = [np.abs(system.J[block.rows, COLUMNS:]).max(axis=0) > 0.0 for block in system.blocks]
-
-    def sigma(without: int) -> Array:
-        kept = np.ones(len(system.residual), np.bool_)
-        for block, psi in zip(system.blocks, motion_psi, strict=True):
-            if without >= 0 and psi[3 * without : 3 * without + 3].any():
-                kept[block.rows] = False
-        V = found.V[np.ix_(kept, kept)]
-        N = J[kept].T @ cho_solve(cho_factor(V, lower=True), J[kept]) + prior
-        scale = 1.0 / np.sqrt(np.diag(N))
-        inverse = np.linalg.inv(N * scale * scale[:, None])[:m, :m] * scale[:m] * scale[:m, None]
-        return np.sqrt(np.diag(inverse))
-
-    whole = sigma(-1)
-    return tuple(float((sigma(k) / whole).max()) for k in range(K))

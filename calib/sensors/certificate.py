@@ -212,7 +212,7 @@ def provenance_document(result: SensorsResult, kept: set[str]) -> dict[str, Any]
     adjustment = result.adjustment
     if adjustment is None:
         return {}
-    gyro, accelerometer = adjustment.wander
+    gyro, accelerometer, *_ = adjustment.wander
     site = result.inputs.site
     document = {
         "software": software(),

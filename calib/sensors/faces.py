@@ -21,7 +21,7 @@ from imudrv.units import ARCSEC
 SQUARENESS: Final = 3 * ARCSEC
 """Prior of the squareness of a face, 1 sigma."""
 SETTING: Final = 1 * ARCSEC
-"""Uncertainty of how the unit stands on its face, 1 sigma, until the residuals show it."""
+"""Least uncertainty of how the unit stands on its face, 1 sigma; the residuals show more."""
 PLATE: Final = 0.1
 """Prior of the tilt of the plate, rad."""
 
@@ -83,17 +83,17 @@ def find_faces(attitudes: Sequence[Array]) -> Faces:
         )
     faces = sorted(set(names))
     C = np.eye(3)
+    rms = SETTING
     for _ in range(4):
-        x, covariance, residual = _solve(attitudes, C, names, faces)
+        x, covariance, residual = _solve(attitudes, C, names, faces, max(rms, SETTING))
+        rms = float(np.sqrt(np.mean(residual**2)))
         C = Rotation.from_rotvec(-x[:3]).as_matrix() @ C
     squareness = {name: x[5 + 3 * k : 8 + 3 * k] for k, name in enumerate(faces)}
-    rms = float(np.sqrt(np.mean(residual**2)))
-    grown = covariance[:3, :3] * max(1.0, (rms / SETTING) ** 2)
-    return Faces(C, grown, x[3:5], squareness, rms)
+    return Faces(C, covariance[:3, :3], x[3:5], squareness, rms)
 
 
 def _solve(
-    attitudes: Sequence[Array], C: Array, names: Sequence[str], faces: Sequence[str]
+    attitudes: Sequence[Array], C: Array, names: Sequence[str], faces: Sequence[str], setting: float
 ) -> tuple[Array, Array, Array]:
     """Return theta, p and d, their covariance, and the residuals along the faces, rad."""
     n = 5 + 3 * len(faces)
@@ -114,8 +114,8 @@ def _solve(
         rows.append(across @ A)
         values.append(across @ (in_b[:, 2] - e))
     X, y = np.concatenate(rows), np.concatenate(values)
-    N += X.T @ X / SETTING**2
-    rhs += X.T @ y / SETTING**2
+    N += X.T @ X / setting**2
+    rhs += X.T @ y / setting**2
     covariance = np.asarray(np.linalg.inv(N), np.float64)
     x = covariance @ rhs
     return x, covariance, y - X @ x

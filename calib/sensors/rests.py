@@ -49,6 +49,10 @@ class Noise:
     velocity_walk: float
 
 
+LEAST_NOISE: Final = Noise(1e-7, 1e-5)
+"""Least noise that is believed, 0.0003 deg/sqrt(h) and 1 ug/sqrt(Hz); the integration errs by less."""
+
+
 @dataclass(frozen=True)
 class RestBins:
     """A rest: sums of its increments at nominal scale over bins of a second.
@@ -257,11 +261,31 @@ def read_evidence(
         for item in _links(pulses(), [(k, still[k]) for k in numbers], layout, nominal):
             if isinstance(item, Link):
                 links.append(item)
+                left += _division(item, still)
                 fastest = max(fastest, float(np.abs(item.samples["gyro"] / item.samples["T"][:, None]).max()))
             else:
                 left.append(item)
     ordered = tuple(sorted(left, key=lambda one: (one.session, one.start_s)))
     return Evidence(tuple(still), tuple(links), ordered, noise, quanta, fastest)
+
+
+KNOCK_S: Final = 10.0
+KNOCK_RAD: Final = 0.02
+"""Longest motion, and largest turn of it, that is a knock within one rest."""
+
+
+def _division(link: Link, rests: Sequence[RestBins]) -> Iterator[Left]:
+    """Yield that one rest was divided into two, if it was."""
+    before, after = rests[link.before], rests[link.after]
+    turned = np.abs(link.samples["gyro"].sum(axis=0)).max()
+    if link.duration_s > KNOCK_S or turned > KNOCK_RAD:
+        return
+    moved_s = link.duration_s - 2.0 * GUARD_S
+    if moved_s < 0.1 * GUARD_S:
+        reason = "it is long: divided into two rests"
+    else:
+        reason = f"a knock of {moved_s:.1f} s at {before.stop_s + GUARD_S:.1f} s: divided into two rests"
+    yield Left(before.session, before.start_s, after.stop_s, "rest", reason)
 
 
 LEAST_RESTS: Final = 3
@@ -546,7 +570,7 @@ def rest_noise(rests: Sequence[RestBins]) -> Noise:
             continue
         walk = (variance[-1] - variance[0]) / (2.0 * (lags[-1] - lags[0]) * bin_s)
         walks.append(sqrt(max(float(walk), 0.0)))
-    return Noise(*walks)
+    return Noise(max(walks[0], LEAST_NOISE.angle_walk), max(walks[1], LEAST_NOISE.velocity_walk))
 
 
 _LAGS: Final = (1, 6)

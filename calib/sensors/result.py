@@ -71,6 +71,17 @@ class Estimate:
     observable: bool
     start: float
 
+    @property
+    def is_shown(self) -> bool:
+        """Whether it is a number of its own: not fixed by the gauge or by a length of 1."""
+        if ".C_" not in self.path:
+            return True
+        return self.path[-5] != self.path[-2] and self.sigma > LEAST_AXIS_SIGMA
+
+
+LEAST_AXIS_SIGMA = 1e-12
+"""Below it an element of an axes matrix is fixed by the gauge."""
+
 
 @dataclass(frozen=True)
 class SensorsInput:
@@ -156,11 +167,16 @@ class SensorsResult:
     @cached_property
     def estimates(self) -> tuple[Estimate, ...]:
         """The numbers that were free."""
+        if self.adjustment is None:
+            return ()
         p, P = self._in_frame
+        nominal, free = self.inputs.nominal, self.inputs.free
+        # The faces define axes, and are uncertain themselves: what is observable does not depend on them.
+        observable = free_numbers(self.adjustment.p, self.start, self.adjustment.covariance, nominal, free)[3]
         return tuple(
             Estimate(number.path, number.value if shown else start.value, sigma, shown, start.value)
             for number, start, sigma, shown in zip(
-                *free_numbers(p, self.start, P, self.inputs.nominal, self.inputs.free), strict=True
+                *free_numbers(p, self.start, P, nominal, free)[:3], observable, strict=True
             )
         )
 

@@ -1,6 +1,6 @@
 """Verdict on a calibration of the sensors: the sentences, each with its mark."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from math import degrees
 from typing import Final
 
@@ -23,7 +23,6 @@ SCALE_LIMIT: Final = 0.2
 """Largest deviation of a scale from nominal."""
 TEMPERATURE_K: Final = 1.0
 """Largest change of temperature that is not mentioned."""
-AT_CEILING: Final = 0.999
 
 
 def judge(
@@ -31,10 +30,11 @@ def judge(
 ) -> Iterator[Judgement]:
     """Yield the sentences on an adjustment that converged."""
     lacking = [one.path for one in estimates if not one.observable]
-    known = sum(one.observable for one in estimates)
+    shown = [one for one in estimates if one.is_shown]
+    known = sum(one.observable for one in shown)
     yield Judgement(
         "good",
-        f"{len(evidence.rests)} rests and {len(evidence.links)} motions; {known} of {len(estimates)} numbers "
+        f"{len(evidence.rests)} rests and {len(evidence.links)} motions; {known} of {len(shown)} numbers "
         "are observable.",
     )
     reduced, freedom = adjustment.reduced, adjustment.degrees_of_freedom
@@ -56,18 +56,17 @@ def judge(
     yield from _scales(adjustment)
     if lacking:
         yield Judgement(
-            "note", f"Not observable, and kept at the start or left out: {', '.join(_short(lacking))}."
+            "note", f"Not observable, and kept at the start or left out: {', '.join(grouped(lacking))}."
         )
 
 
 def _wander(adjustment: Adjustment) -> Iterator[Judgement]:
-    gyro, accelerometer = adjustment.wander
-    if gyro > AT_CEILING * GYRO_WANDER_CEILING:
+    if adjustment.wander.gyro_exceeds:
         yield Judgement(
             "caution",
             f"The biases of the gyros wander by more than {GYRO_WANDER_CEILING / DEG_PER_H:g} deg/h.",
         )
-    if accelerometer > AT_CEILING * ACCELEROMETER_WANDER_CEILING:
+    if adjustment.wander.accelerometer_exceeds:
         yield Judgement(
             "caution",
             "The biases of the accelerometers wander by more than "
@@ -150,7 +149,7 @@ def earth_judgement(site: Site, earth: np.ndarray, sigmas: float) -> Judgement:
     )
 
 
-def _short(paths: list[str]) -> list[str]:
+def grouped(paths: Sequence[str]) -> list[str]:
     """Return paths, the three of one vector together."""
     groups: dict[str, list[str]] = {}
     for path in paths:
