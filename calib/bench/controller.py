@@ -44,7 +44,17 @@ from calib.bench.session import Session
 from calib.bench.state import REPORT
 from calib.messages import Message, english, message
 from calib.procedure.engine import Engine
-from calib.procedure.events import Aborted, Accepted, Conditions, Entered, Event, Finished, Phase, Rejected
+from calib.procedure.events import (
+    Aborted,
+    Accepted,
+    Conditions,
+    Entered,
+    Event,
+    Finished,
+    Phase,
+    Rejected,
+    View,
+)
 from calib.procedure.plan import steps_left, verification
 from calib.procedure.schema import VERIFICATION, Procedure
 from imudrv.errors import InputError
@@ -80,6 +90,8 @@ class SessionController:
     begin : callable
         Called with the procedure of the steps to do, before their samples are read; a rehearsal starts its
         unit then.
+    watch : callable
+        Called with each view; a simulated technician looks at it.
 
     Attributes
     ----------
@@ -103,6 +115,7 @@ class SessionController:
         hands_free: bool,
         accepts: bool,
         begin: Callable[[Procedure], None],
+        watch: Callable[[View], None] = lambda _: None,
     ) -> None:
         self.error: BaseException | None = None
         self.outcome: tuple[Message, ...] = ()
@@ -114,6 +127,7 @@ class SessionController:
         self._queue = QueueReader(queue, lambda text: session.append(ServiceMessage(text)))
         self._recordings = AttemptRecordings(session, service, self._queue)
         self._hands_free, self._accepts, self._begin = hands_free, accepts, begin
+        self._watch = watch
         self._is_unit_detected = False
         self._conditions = Conditions()
         self._conditions_ns = 0
@@ -217,6 +231,7 @@ class SessionController:
                 if events or is_due:
                     shown_s = time.monotonic()
                     view = with_port_state(engine.view, self._service.port_state)
+                    self._watch(view)
                     self._screen.show(view, self._keys.question)
         except ServiceEndedError:
             self._recordings.record_closed()

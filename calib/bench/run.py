@@ -10,6 +10,7 @@ from signal import SIGINT, SIGTERM
 from threading import Thread
 from typing import Final
 
+import numpy as np
 from rich.console import Console
 
 from calib.bench.completion import accepted_result
@@ -22,7 +23,7 @@ from calib.bench.screen import OperatorScreen
 from calib.bench.session import Session
 from calib.bench.simulated_unit import SimulatedUnitProcess, is_rehearsal
 from calib.bench.state import JOURNAL, REPORT, RESULT, WORKING_CERTIFICATE
-from calib.bench.technician import BENCH
+from calib.bench.technician import BENCH, mistakes_of
 from calib.certificate import lever_arms_of
 from calib.inputs import require_six_axes
 from calib.messages import Message, language, message, text
@@ -78,6 +79,10 @@ class RunOptions:
         Accept the result without a person, unless a verdict is bad.
     rehearse : bool
         Use a simulated unit and technician, hands free.
+    keys : bool
+        A person presses the keys of the rehearsal, and the technician does what the screen says.
+    mistakes : str
+        Mistakes of the technician, see `calib.bench.technician.mistakes_of`.
     speed : str
         Speed of the rehearsal: a number, or ``max``.
     redo : sequence of str
@@ -97,6 +102,8 @@ class RunOptions:
     hands_free: bool = False
     accept: bool = False
     rehearse: bool = False
+    keys: bool = False
+    mistakes: str = ""
     speed: str = "1"
     redo: Sequence[str] = ()
     plan: bool = False
@@ -110,7 +117,7 @@ class RunOptions:
     @property
     def has_operator(self) -> bool:
         """Whether an operator presses keys."""
-        return not (self.hands_free or self.is_rehearsal)
+        return self.keys if self.is_rehearsal else not self.hands_free
 
     def say(self, console: Console, what: Message) -> None:
         """Print a message in the language of the operator."""
@@ -171,7 +178,11 @@ def open_or_create(options: RunOptions, console: Console) -> Session:
 def conduct(session: Session, options: RunOptions, console: Console) -> int:
     """Conduct an open session: the service runs in this thread, the controller in another; see `run`."""
     begun_with = session.plan
-    simulated = SimulatedUnitProcess(session.folder, options.speed) if options.is_rehearsal else None
+    simulated = None
+    if options.is_rehearsal:
+        simulated = SimulatedUnitProcess(
+            session.folder, options.speed, options.mistakes, is_live=options.has_operator
+        )
     queue = QueueSink(QUEUE_LIMIT if simulated is not None and simulated.waits else None)
     profile = session.profile()
     layout = profiles.load(profile).layout()
@@ -206,6 +217,7 @@ def conduct(session: Session, options: RunOptions, console: Console) -> int:
         hands_free=not options.has_operator,
         accepts=options.accept or (options.is_rehearsal and not options.has_operator),
         begin=begin,
+        watch=(lambda _: None) if simulated is None else simulated.watch,
     )
     worker = Thread(target=controller.run, name="controller")
     # From here on: an interrupt while compiled code is loaded could be lost or leave a lock behind.
@@ -249,6 +261,10 @@ def _check(options: RunOptions, exists: bool) -> None:
         raise InputError("expected a terminal for the operator's keys, got none; use one, or --hands-free")
     if options.is_rehearsal and (options.port or options.calibration or options.site):
         raise InputError("--rehearse: expected no --port, --calibration or --site; it has a unit of its own")
+    if (options.keys or options.mistakes) and not options.is_rehearsal:
+        raise InputError("--keys, --mistakes: expected with --rehearse")
+    if options.mistakes:
+        mistakes_of(options.mistakes, plan.load(options.procedure or PROCEDURE), np.random.default_rng())
     if exists and options.rehearse and not is_rehearsal(folder):
         raise InputError(f"{folder}: --rehearse: expected a rehearsal to resume, got the session of a unit")
     if options.redo and not exists:

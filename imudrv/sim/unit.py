@@ -16,10 +16,10 @@ carried into the next sample. The encoder makes counts of rates and of floating-
 Bias steps change `b_g` and `b` during the run.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from math import exp, pi, sin, sqrt
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -34,7 +34,16 @@ from imudrv.nav.earth import earth_rate_n
 from imudrv.records import Records
 from imudrv.sim.integrate import Body, Dithering, Integrals, Motion, Shaking
 from imudrv.sim.path import cycles_at, split_cycles
-from imudrv.sim.scenario import Dither, Faults, Motor, Residuals, Saturation, Scenario, nominal
+from imudrv.sim.scenario import (
+    Dither,
+    Faults,
+    Motor,
+    OneMotion,
+    Residuals,
+    Saturation,
+    Scenario,
+    nominal,
+)
 from imudrv.units import ARCSEC, DEG_PER_H, DEG_PER_SQRT_H, MM, NS, PPM, STANDARD_GRAVITY, UG, URAD
 from imudrv.vectors import Vector, dot, row
 from imudrv.wire.layout import Layout, SequenceKind, Values
@@ -54,6 +63,10 @@ TRUTH: Final = np.dtype(
     align=True,
 )
 """Truth of one sample interval."""
+
+
+More: TypeAlias = Callable[[], OneMotion]
+"""Source of the next motion of a unit that is moved while it is simulated."""
 
 
 @dataclass(frozen=True)
@@ -154,7 +167,9 @@ def draw_true_unit(scenario: Scenario, layout: Layout) -> Coefficients:
     )
 
 
-def simulate(scenario: Scenario, layout: Layout, chunk: int = 65_536) -> Iterator[Chunk]:
+def simulate(
+    scenario: Scenario, layout: Layout, chunk: int = 65_536, more: More | None = None
+) -> Iterator[Chunk]:
     """Simulate a scenario.
 
     Parameters
@@ -166,6 +181,8 @@ def simulate(scenario: Scenario, layout: Layout, chunk: int = 65_536) -> Iterato
         Layout of the profile; durations of the motion are rounded to whole sample intervals.
     chunk : int
         Number of samples at a time; any value gives the same bits.
+    more : callable, optional
+        Called for the next motion when those before are used up; there is no end then.
 
     Yields
     ------
@@ -193,9 +210,15 @@ def simulate(scenario: Scenario, layout: Layout, chunk: int = 65_536) -> Iterato
     electronics = _electronics(scenario, truth, layout)
     start = scenario.start.counter if layout.sequence.kind is SequenceKind.COUNTER else 0
     carry = np.zeros(6)
-    for first in range(0, motion.samples, chunk):
+    first, n = 0, 0
+    begin = min(0, skew)
+    while True:
+        first += n
+        while more is not None and motion.samples <= first + chunk + max(0, skew + 1):
+            motion.append(more())
         n = min(chunk, motion.samples - first)
-        begin = min(0, skew)
+        if n <= 0:
+            return
         around = motion.integrals(first + begin, first + n + max(0, skew + 1))
         own = Integrals(*(a[-begin : n - begin] for a in around))
         later = skew - begin
