@@ -367,7 +367,7 @@ def named_poses(attitudes: Sequence[Array], procedure: Procedure | None) -> tupl
     for C_nb in attitudes:
         name = pose_of(C_nb)
         if procedure is not None:
-            steps = [(step.id, step.C_bn) for step in procedure.steps]
+            steps = [(rest.id, rest.C_bn) for rest in procedure.rests]
             turned = [(id_, C_bn @ np.diag([-1.0, -1.0, 1.0])) for id_, C_bn in steps]
             near = {id_: angle(C_nb @ C_bn) for id_, C_bn in [*turned, *steps]}
             planned = min(near, key=lambda id_: near[id_])

@@ -18,7 +18,7 @@ Bias steps change `b_g` and `b` during the run.
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from math import exp, pi, sin
+from math import exp, pi, sin, sqrt
 from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -35,7 +35,6 @@ from imudrv.records import Records
 from imudrv.sim.integrate import Body, Dithering, Integrals, Motion, Shaking
 from imudrv.sim.path import cycles_at, split_cycles
 from imudrv.sim.scenario import (
-    BiasStep,
     Dither,
     Faults,
     Motor,
@@ -46,7 +45,7 @@ from imudrv.sim.scenario import (
     nominal,
 )
 from imudrv.units import ARCSEC, DEG_PER_H, DEG_PER_SQRT_H, MM, NS, PPM, STANDARD_GRAVITY, UG, URAD
-from imudrv.vectors import Vector, add, dot, row
+from imudrv.vectors import Vector, dot, row
 from imudrv.wire.layout import Layout, SequenceKind, Values
 
 PER_SQRT_H: Final = 1.0 / 60.0
@@ -86,6 +85,10 @@ class Chunk:
     truth: Records
 
 
+_WANDER_STEP: Final = 0.05
+"""Interval of the steps of a bias wander, in time constants."""
+
+
 class _Counts(NamedTuple):
     """What each axis can send, gyro and accelerometer X Y Z: arrays of shape (6,)."""
 
@@ -115,7 +118,7 @@ class _Electronics(NamedTuple):
     accelerometer_noise: float  # m/s
     counts: _Counts
     step_at_s: Array  # (m,), when biases change
-    steps: Array  # (m, 6), of gyros, rad/s, and accelerometers, m/s^2
+    steps: Array  # (m + 1, 6), sums of the changes before, of gyros, rad/s, and accelerometers, m/s^2
     reference_degc: float
     start_degc: float
     slope_k_per_s: float
@@ -379,7 +382,7 @@ def _electronics(scenario: Scenario, truth: Coefficients, layout: Layout) -> _El
     settles = temperature.settles_at_degc
     G = _inverse(truth.C_bg)
     terms = truth.temperature or TemperatureTerms(0.0, 0.0, 0.0)
-    step_at_s, steps = _bias_steps(unit.bias_steps)
+    step_at_s, steps = _bias_changes(scenario)
     return _Electronics(
         interval_s=interval_s,
         G=G,
@@ -407,13 +410,36 @@ def _electronics(scenario: Scenario, truth: Coefficients, layout: Layout) -> _El
     )
 
 
-def _bias_steps(steps: tuple[BiasStep, ...]) -> tuple[Array, Array]:
+def _bias_changes(scenario: Scenario) -> tuple[Array, Array]:
+    """Return the times of the bias steps and of the wander, in order, and the sums before each of them."""
+    steps = scenario.unit.bias_steps
     at_s, changes = np.zeros(len(steps)), np.zeros((len(steps), 6))
     for k, step in enumerate(steps):
         at_s[k] = step.at_s
         changes[k, :3] = np.array(step.gyro_deg_per_h) * DEG_PER_H
         changes[k, 3:] = np.array(step.accelerometer_ug) * UG
-    return at_s, changes
+    wanders_at_s, wanders = _wander(scenario)
+    at_s, changes = np.append(at_s, wanders_at_s), np.concatenate([changes, wanders])
+    order = np.argsort(at_s, kind="stable")
+    sums = np.concatenate([np.zeros((1, 6)), np.cumsum(changes[order], axis=0)])
+    return at_s[order], sums
+
+
+def _wander(scenario: Scenario) -> tuple[Array, Array]:
+    """Return times and sizes of the steps of Gauss-Markov processes."""
+    wander = scenario.unit.bias_wander
+    if wander is None:
+        return np.zeros(0), np.zeros((0, 6))
+    interval_s = _WANDER_STEP * wander.time_constant_s
+    duration_s = sum(motion.duration_s for motion in scenario.motions)
+    normal = _generator(scenario.seed, 8).standard_normal((1 + int(duration_s / interval_s), 6))
+    left = exp(-_WANDER_STEP)
+    values = np.empty_like(normal)
+    values[0] = normal[0]
+    for k in range(1, len(normal)):
+        values[k] = left * values[k - 1] + sqrt(1.0 - left**2) * normal[k]
+    values *= np.repeat([wander.gyro_deg_per_h * DEG_PER_H, wander.accelerometer_ug * UG], 3)
+    return interval_s * np.arange(len(values), dtype=np.float64), np.diff(values, axis=0, prepend=0.0)
 
 
 def _truth(pulses: Records, own: Integrals) -> Records:
@@ -482,14 +508,9 @@ def _input(unit: _Electronics, axis: int, velocity: float) -> float:
 
 @kernel
 def _bias_change(unit: _Electronics, t: float) -> tuple[Vector, Vector]:
-    """Return the sum of the bias steps before the end of a sample, of gyros and accelerometers."""
-    gyro, accelerometer = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    for k in range(unit.step_at_s.size):
-        if t > unit.step_at_s[k]:
-            step = unit.steps[k]
-            gyro = add(gyro, (step[0], step[1], step[2]))
-            accelerometer = add(accelerometer, (step[3], step[4], step[5]))
-    return gyro, accelerometer
+    """Return the sum of the bias changes before the end of a sample, of gyros and accelerometers."""
+    total = unit.steps[np.searchsorted(unit.step_at_s, t)]
+    return (total[0], total[1], total[2]), (total[3], total[4], total[5])
 
 
 @kernel
