@@ -66,6 +66,12 @@ REST_S: Final = {"arms": (2.0, 600.0), "sensors": (20.0, 3600.0), "noise": (20.0
 TurnTime = Annotated[float, Key(ge=0.5, le=60)]
 
 
+def _given(settings: Model) -> set[str]:
+    """Return the keys that are not at their defaults, which a file written from a model has too."""
+    fields = type(settings).model_fields
+    return {name for name, field in fields.items() if getattr(settings, name) != field.default}
+
+
 class PlannedTurn(Model):
     """Motion of a turntable into a pose, right-handed about a body axis: never a measurement."""
 
@@ -204,7 +210,7 @@ class Procedure(Model):
 
     @model_validator(mode="after")
     def _keys_of_the_version(self) -> Self:
-        given = self.model_fields_set.union(*(pose.model_fields_set for pose in self.poses))
+        given = _given(self).union(*map(_given, self.poses))
         newer = sorted(given & {"kind", "turn_s", "turns", "alternate", "turn"})
         if self.version == 1 and newer:
             raise ValueError(f"expected no {', '.join(newer)} in version 1, got one; write version: 2")
@@ -229,7 +235,7 @@ class Procedure(Model):
                 raise ValueError(f"poses: {pose.id}: expected turn_deg, 180 or -180, got none")
             if self.kind == "arms" and pose.turn is not None:
                 raise ValueError(f"poses: {pose.id}: expected turn in a procedure of kind sensors only")
-            if self.kind != "arms" and (alien := pose.model_fields_set & _OF_ARMS):
+            if self.kind != "arms" and (alien := _given(pose) & _OF_ARMS):
                 raise ValueError(
                     f"poses: {pose.id}: expected no {', '.join(sorted(alien))} in a procedure of kind "
                     f"{self.kind}"
