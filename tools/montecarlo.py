@@ -14,7 +14,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import asdict, replace
 from typing import Any, NamedTuple
 
-import numpy as np
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -30,6 +29,7 @@ from calib.validation.montecarlo import (
     SITE,
     Budget,
     captures,
+    drawn,
     nominal,
     statistics,
     true_arms,
@@ -75,45 +75,6 @@ def outcome(seed: int, budget: Budget) -> Outcome:
     )
     worst = next(mark for mark in marks if mark.level == overall.level)
     return Outcome(overall.level, worst.text, estimate, truth)
-
-
-def drawn(seed: int) -> Budget:
-    """Return conditions drawn at random; the priors are the defaults of the product."""
-    rng = np.random.default_rng([seed, 99])
-
-    def some(low: float, high: float, share: float = 0.3) -> float:
-        """Draw a number in a share of the cases, 0 in the others."""
-        return float(rng.uniform(low, high)) if rng.random() < share else 0.0
-
-    turns = int(rng.choice([1, 1, 1, 5]))
-    dither = some(-1.0, 5.0)  # natural logarithm of arcsec
-    return Budget(
-        bias_ug=float(rng.uniform(0.0, 70.0)),
-        misalignment_urad=float(rng.uniform(0.0, 150.0)),
-        arw_deg_per_sqrt_h=float(rng.uniform(0.0005, 0.005)),
-        vrw_m_s_per_sqrt_h=float(rng.uniform(0.001, 0.01)),
-        turn_s=float(rng.uniform(1.0, 5.0)),
-        turns=turns,
-        arrest_s=4.0 if turns > 1 else 12.0,
-        angle_deg=float(rng.uniform(176.0, 184.0)),
-        axis_tilt_mrad=float(rng.uniform(0.0, 15.0)),
-        pivot_mm=float(rng.uniform(0.0, 150.0)),
-        arms_mm=float(rng.uniform(10.0, 150.0)),
-        skew_ms=float(rng.normal(0.0, 0.5)),
-        pulse_factor=float(rng.choice([0.1, 1.0, 1.0, 3.0, 10.0])),
-        dither_arcsec=float(np.exp(dither)) if dither else 0.0,
-        case_reaction=some(0.0, 0.02),
-        pose_bias_ug=some(0.0, 40.0),
-        warming_k_per_min=some(0.0, 0.15),
-        wobble_deg=some(0.0, 3.0),
-        motor_mg=some(0.0, 3.0),
-        motor_hz=float(rng.uniform(10.0, 60.0)),
-        lean_urad=some(0.0, 20.0, 0.2) if turns == 1 else 0.0,
-        signs=(1, -1) if rng.random() < 0.7 else (1,),
-        interval_ms=float(rng.choice([1.0, 1.0, 2.5, 5.0])),
-        one_file=bool(rng.random() < 0.2),
-        priors=Priors(),
-    )
 
 
 def search(seeds: Iterable[int]) -> Iterator[tuple[int, Outcome]]:

@@ -15,7 +15,7 @@ from calib.estimation.result import LeverArmEstimate
 from calib.estimation.rigid_motion import rigid_motion
 from calib.estimation.runs import navigate_rotations
 from calib.estimation.walk import random_walk
-from calib.validation.montecarlo import PRIORS, Budget, case, worst_sigma
+from calib.validation.montecarlo import PRIORS, Budget, case, drawn, worst_sigma
 from imudrv.arrays import Array
 from imudrv.files.settings_file import parse
 from imudrv.records import Records
@@ -58,6 +58,15 @@ def test_the_error_is_within_its_uncertainty(budget: Budget, limit_mm: float) ->
     assert found.scatter is not None
     # 500 degrees of freedom, and noise known to 5 %: three times 12 %
     assert found.scatter.value / found.scatter.degrees_of_freedom == pytest.approx(1.0, abs=0.4)
+
+
+@pytest.mark.parametrize("seed", [4, 21])
+def test_conditions_drawn_at_random_give_no_certificate_beyond_four_sigma(seed: int) -> None:
+    """A sample of `tools/montecarlo.py --search`."""
+    budget = drawn(seed)
+    runs, truth = case(seed, budget)
+    found = estimate_joint(runs, budget.priors)
+    assert found.refusals or worst_sigma(found, truth) < 4.0
 
 
 def test_bias_from_run_to_run_contradicts_an_estimate_that_does_not_allow_for_it() -> None:

@@ -290,9 +290,11 @@ def test_a_shaking_that_the_filter_passes_is_refused(simulated: tuple[list[Run],
 def test_a_plan_predicts_what_the_data_then_give(simulated: tuple[list[Run], Array]) -> None:
     found = estimate_joint(simulated[0])
     predicted = predict(BOTH, LATITUDE, found.noise)
-    # the plan knows neither tilts, nor how well the heading was aligned, nor when pulses arrive
-    np.testing.assert_allclose(predicted.differences_sigma, found.differences_sigma, rtol=0.15)
-    np.testing.assert_allclose(predicted.covariance, found.covariance, atol=0.25 * found.covariance.max())
+    # the plan does not know where the unit is from the axis, on which the effect of a skew depends
+    np.testing.assert_allclose(predicted.differences_sigma, found.differences_sigma, rtol=0.12)
+    assert np.linalg.norm(found.differences_sigma) == pytest.approx(
+        np.linalg.norm(predicted.differences_sigma), rel=0.05
+    )
 
 
 def test_slower_rotations_and_fewer_predict_more() -> None:
