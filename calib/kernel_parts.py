@@ -4,7 +4,10 @@ import numpy as np
 
 from calib.detection.blocks import Block, BlockSums
 from calib.detection.tracking import AttitudeTracker, RestAverages, RotationTracker, StillnessDetector
+from calib.sensors.motion import SAMPLE, integrate
+from calib.sensors.parameters import Parameters
 from imudrv.records import INCREMENTS
+from imudrv.sim.path import minimum_jerk
 
 
 def detection() -> None:
@@ -21,3 +24,12 @@ def detection() -> None:
     attitude.lean(up)
     attitude.azimuth(up)
     _ = turned.axis_tilt
+
+
+def sensors() -> None:
+    """Motions between rests."""
+    samples = np.zeros(3, SAMPLE)
+    samples["T"] = 1e-3
+    still = np.zeros(3), np.zeros(3)
+    integrate(samples, Parameters(9.8, np.zeros(2)), still, still)
+    minimum_jerk(0.5)

@@ -248,6 +248,7 @@ def solve(
         leave_one_out=leave_one_out(found, options.free, gravity_sigma),
     )
     verdict = [
+        *_unplanned(result.poses, procedure),
         *judge(found, result.estimates, evidence, result.poses),
         *extra,
         *gravity_judgement(site, gravity_sigma),
@@ -265,6 +266,13 @@ def solve(
             )
         )
     return replace(result, verdict=tuple(verdict))
+
+
+def _unplanned(poses: Sequence[str], procedure: Procedure | None) -> Iterator[Judgement]:
+    """Yield the sentence on poses that were planned and are not there."""
+    absent = [step.id for step in procedure.steps if step.id not in poses] if procedure else []
+    if absent:
+        yield Judgement("note", f"Planned and not found: {', '.join(absent)}.")
 
 
 def _missing(result: SensorsResult) -> Iterator[str]:
@@ -367,11 +375,13 @@ def named_poses(attitudes: Sequence[Array], procedure: Procedure | None) -> tupl
     for C_nb in attitudes:
         name = pose_of(C_nb)
         if procedure is not None:
-            steps = [(step.id, step.C_bn) for step in procedure.steps]
-            turned = [(id_, C_bn @ np.diag([-1.0, -1.0, 1.0])) for id_, C_bn in steps]
-            near = {id_: angle(C_nb @ C_bn) for id_, C_bn in [*turned, *steps]}
-            planned = min(near, key=lambda id_: near[id_])
-            if near[planned] < NEAR_POSE:
+            half = np.diag([-1.0, -1.0, 1.0])  # a turn in place: the same pose
+            near = [
+                (min(angle(C_nb @ step.C_bn), angle(half @ C_nb @ step.C_bn)), step.id)
+                for step in procedure.steps
+            ]
+            distance, planned = min(near)
+            if distance < NEAR_POSE:
                 name = planned
         names.append(name)
     return tuple(names)
