@@ -287,8 +287,8 @@ def _create(options: RunOptions, console: Console) -> Session:
     procedure = plan.load_file(name)
     if procedure.model.kind != "arms":
         raise InputError(
-            f"{name}: expected a procedure of kind arms, got one of kind {procedure.model.kind}; record all of it "
-            f"with imudrv run --record, then use calib {procedure.model.kind}"
+            f"{name}: expected a procedure of kind arms, got one of kind {procedure.model.kind}; record all "
+            f"of it with imudrv run --record, then use calib {procedure.model.kind}"
         )
     port, calibration, site, profile = options.port, options.calibration, options.site, options.profile
     if options.is_rehearsal:

@@ -40,7 +40,7 @@ def text(procedure: Procedure, site: Site) -> str:
     Returns
     -------
     str
-        Lines: the rests, how long all takes, and for the sensors the largest sigma of each kind of number with
+        Lines: the rests, how long all takes, and for the sensors the largest sigma of each kind of number,
         what is not observable, and which motion would show it.
     """
     rests = procedure.rests
