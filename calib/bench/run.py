@@ -31,6 +31,7 @@ from calib.procedure import plan
 from calib.procedure.schema import Procedure
 from calib.reports.text import as_text
 from calib.reports.truth import comparison
+from calib.sensors import plan as sensors_plan
 from imudrv import profiles
 from imudrv.calibration import coefficients, read_calibration
 from imudrv.errors import InputError
@@ -276,13 +277,19 @@ def _plan_text(options: RunOptions) -> str:
     if options.site is None and not options.rehearse:
         raise InputError("--plan: expected --site, for the latitude, or --rehearse")
     site = BENCH if options.site is None else settings_file.read(options.site, Site)
-    return plan.text(plan.load(options.procedure or PROCEDURE), site)
+    procedure = plan.load(options.procedure or PROCEDURE)
+    return plan.text(procedure, site) if procedure.kind == "arms" else sensors_plan.text(procedure, site)
 
 
 def _create(options: RunOptions, console: Console) -> Session:
     """Create a session, and print the expected accuracy of its procedure."""
     folder, name = options.folder, options.procedure or PROCEDURE
     procedure = plan.load_file(name)
+    if procedure.model.kind != "arms":
+        raise InputError(
+            f"{name}: expected a procedure of kind arms, got one of kind {procedure.model.kind}; record all "
+            f"of it with imudrv run --record, then use calib {procedure.model.kind}"
+        )
     port, calibration, site, profile = options.port, options.calibration, options.site, options.profile
     if options.is_rehearsal:
         profile = profile or REHEARSAL_PROFILE

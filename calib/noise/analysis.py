@@ -113,8 +113,8 @@ class NoiseResult:
                 (
                     "bad" if len(rejected) == len(self.channels) else "caution",
                     f"{names}: not the noise of a unit at rest (reduced chi-square up to {worst:.3g}, "
-                    f"expected at most {MOST_CHI_SQUARE:g}): motion, vibration or a dither line; "
-                    "upper limits only",
+                    f"expected at most {MOST_CHI_SQUARE:g}): motion, vibration, a dither line, or pulses "
+                    "that come too regularly for a rest of this length; upper limits only",
                 )
             )
         if disturbed := sum(capture.disturbed for capture in self.captures):
