@@ -1,6 +1,7 @@
 """Recordings of the attempts of a session."""
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import fields
 
 import numpy as np
@@ -15,6 +16,7 @@ from calib.procedure.events import Accepted, NavigationLog
 from calib.procedure.schema import Step
 from imudrv.errors import InputError
 from imudrv.files.atomic import atomic_write
+from imudrv.recording.pack import pack
 from imudrv.service.loop import Service
 
 
@@ -66,10 +68,13 @@ class AttemptRecordings:
             self.record_closed()
 
     def record_closed(self) -> None:
-        """Record the hash of the current recording, which the service has closed."""
+        """Pack the current recording, which the service has closed, and record its hash."""
         name, self._current = self._current, ""
         if name:
-            self._session.record_file(f"{name}.mcap")
+            path = self._session.folder / f"{name}.mcap"
+            with suppress(InputError):  # no room, or a damaged file: it stays as it was written
+                pack(path, path)
+            self._session.record_file(path.name)
 
     def file(
         self, step: Step, accepted: Accepted, log: NavigationLog, degc: Mapping[str, float | None]

@@ -33,6 +33,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--record", metavar="FILE.mcap", help="record everything; in a folder: one file for each run")
     text = "have the disk keep the recording at least this often (default: when the system does, 5 to 30 s)"
     add("--sync", dest="sync_s", type=float, metavar="S", help=text)
+    text = "leave the recording as it was written, neither compressed nor indexed at the end of the run"
+    add("--no-pack", dest="pack", action="store_false", default=None, help=text)
     add("--rate-filter", choices=NAMES, help="angular rate for the size effect (default: causal)")
     add("--status", metavar="PATH", help="socket that reports the status")
     add("--realtime", action="store_true", default=None, help="request SCHED_FIFO and locked memory")

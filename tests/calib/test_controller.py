@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from rich.console import Console
 
 from calib.bench import completion
@@ -327,6 +328,10 @@ def test_a_recording_begins_where_the_engine_asked_for_the_unit_to_be_placed(
     assert placed.counter - 600 < pulses["counter"][0] <= placed.counter
     assert (np.diff(pulses["counter"]) == 1).all()
     assert np.array_equal(published, pulses["counter"])
+    with recording.path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    assert summary.chunk_indexes, "it is packed before its hash enters the journal"
 
 
 @pytest.mark.parametrize("history_bytes", [1 << 20, 4 << 20])
