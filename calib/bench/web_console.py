@@ -20,7 +20,7 @@ from calib.bench.state import REPORT, WEB_TOKEN
 from calib.messages import LANGUAGES, Message, catalogue, text
 from calib.procedure.events import Action, View
 from calib.procedure.plan import verification
-from calib.reports.identification import verdict
+from calib.reports.verdict import verdict
 from imudrv.arrays import Array
 from imudrv.units import MM
 from imudrv.web.server import PageServer
