@@ -103,8 +103,7 @@ def channel(t_s: Array, v: Array, increments: Array, pulse: float, walk: float) 
     """
     at, variance, one_way = passages(increments, pulse)
     sharp = _between(t_s, v, at, variance)
-    kernel = np.hanning(2 * max(1, round(0.5 * SMOOTH_S / float(np.median(np.diff(t_s))))) + 1)
-    kernel /= kernel.sum()
+    kernel = _kernel(t_s)
     if len(at) < 2 or len(t_s) < 3 * len(kernel):
         return sharp
     own = _roughness(np.interp(t_s, sharp.t_s, sharp.v), kernel, walk)
@@ -120,6 +119,18 @@ def channel(t_s: Array, v: Array, increments: Array, pulse: float, walk: float) 
         share = (np.maximum(level[at], level[at - 1]) - 0.5 - count[at - 1]) / (count[at] - count[at - 1])
     smooth = _between(smooth_t, smooth_v, at, 0.0, share)
     return smooth._replace(variance=np.full(len(at), _own_variance(smooth, walk)))
+
+
+def vibration(t_s: Array, increments: Array) -> float:
+    """Return the mean square of a counted sum about its mean over `SMOOTH_S`."""
+    kernel = _kernel(t_s)
+    return _roughness(np.cumsum(increments), kernel, 0.0) if len(t_s) > len(kernel) else 0.0
+
+
+def _kernel(t_s: Array) -> Array:
+    """Return the weights of the means."""
+    kernel = np.hanning(2 * max(1, round(0.5 * SMOOTH_S / float(np.median(np.diff(t_s))))) + 1)
+    return np.asarray(kernel / kernel.sum(), np.float64)
 
 
 def _between(

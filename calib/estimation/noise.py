@@ -55,4 +55,4 @@ def _pooled(walks: Sequence[WalkEstimate], sensor: str) -> tuple[float, int]:
             f"noise: expected pulses of a {sensor} in the rests before the turns, got none; check the "
             "calibration's scale factors, and the wiring"
         )
-    return sqrt(max(squares, 0.0) / freedom), int(freedom)
+    return sqrt(max(squares, 0.0) / freedom), max(1, round(freedom))

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.estimation.channel import Channel, channel
+from calib.estimation.channel import Channel, channel, vibration
 from imudrv.arrays import Array
 
 NEAR_S: Final = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35)
@@ -85,8 +85,11 @@ def read_rests(rests: Sequence[RestSamples], A: Array, pulse: Array, walk: float
             read = read.joined(_next_to_turns(rest, v, read.t_s, p, after=after, before=before))
             parts.append((np.full(len(read.t_s), k), np.tile(direction_n, (len(read.t_s), 1)), *read))
     arrest, direction_n, t_s, v, variance = map(np.concatenate, zip(*parts, strict=True))
-    edges = rests[0].C_nb @ np.linalg.inv(A) * pulse  # column i: a pulse of accelerometer i, in n
-    return Readings(t_s, arrest, direction_n, v, np.maximum(variance, LEAST_VARIANCE), edges @ edges.T / 12.0)
+    first = rests[0]
+    shaken = [vibration(first.t_s, dv) for dv in first.dv_a.T]
+    fraction = np.sqrt(np.maximum(pulse**2 / 12.0, shaken * (pulse > 0.0)))
+    edges = first.C_nb @ np.linalg.inv(A) * fraction  # column i: the start of accelerometer i, in n
+    return Readings(t_s, arrest, direction_n, v, np.maximum(variance, LEAST_VARIANCE), edges @ edges.T)
 
 
 def level_channels(up_a: Array) -> list[int]:

@@ -56,6 +56,10 @@ SETTLING_S: Final = 2.0
 """Beginning of an alignment that the noise is not taken from, s: what was put down is still settling."""
 
 
+FEW: Final = 5
+"""Degrees of freedom below which a random walk is not taken from the level accelerometers alone."""
+
+
 _AT_ONCE: Final = 8192
 """Samples that are navigated at once; a row of H takes 500 bytes."""
 
@@ -405,10 +409,10 @@ class _RunBuilder:
         return np.asarray(np.cumsum(np.einsum("nij,nj->ni", middle, corrected), axis=0), np.float64)
 
     def _velocity_walk(self, t_s: Array, dv_a: Array, up_a: Array) -> WalkEstimate:
-        """Return the random walk of the level accelerometers; of all, if those send no pulses."""
+        """Return the random walk of the level accelerometers; of all, if those send too few pulses."""
         pulse = self._setup.pulses.accelerometer
         level = random_walk(t_s, dv_a, pulse, level_channels(up_a))
-        return level if level.degrees_of_freedom else random_walk(t_s, dv_a, pulse, range(3))
+        return level if level.degrees_of_freedom > FEW else random_walk(t_s, dv_a, pulse, range(3))
 
     def _time(self, counter: NDArray[np.int64]) -> Array:
         """Return the time of the end of samples from the start of navigation, s."""

@@ -17,7 +17,7 @@ class WalkEstimate(NamedTuple):
     """Sum of squared differences that estimates a random walk, and its degrees of freedom."""
 
     squares: float  # rad^2/s or (m/s)^2/s, less what the readings' own errors contribute
-    degrees_of_freedom: int
+    degrees_of_freedom: float
 
     @property
     def root(self) -> float:
@@ -50,7 +50,7 @@ def random_walk(t_s: Array, increments: Array, pulse: Array, channels: Iterable[
     -------
     WalkEstimate
     """
-    squares, freedom = 0.0, 0
+    squares, freedom = 0.0, 0.0
     for i in channels:
         total = np.cumsum(increments[:, i])
         # the walk decides how a channel is read; for that a first estimate is good enough
@@ -65,8 +65,10 @@ def _of(read: Channel, step_s: float) -> WalkEstimate:
     """Return the estimate of one channel."""
     chosen = spaced(read.t_s, max(STEP_S, step_s))
     if len(chosen) < 3:
-        return WalkEstimate(0.0, 0)
+        return WalkEstimate(0.0, 0.0)
     dt, dv = np.diff(read.t_s[chosen]), np.diff(read.v[chosen])
     residual = dv - dv.sum() / dt.sum() * dt
-    own = 2.0 * read.variance[0] * (1.0 / dt).sum()
-    return WalkEstimate(float((residual**2 / dt).sum() - own), len(dt) - 1)
+    squares, own = float((residual**2 / dt).sum()), float(2.0 * read.variance[0] * (1.0 / dt).sum())
+    share = max(0.0, 1.0 - own / squares) if squares else 0.0
+    # readings whose own error is large say little: their weight is that of the walk in the differences
+    return WalkEstimate(share**2 * (squares - own), share**2 * (len(dt) - 1))
