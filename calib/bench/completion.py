@@ -9,6 +9,7 @@ from calib.bench.result import Result, identify_session
 from calib.bench.screen import OperatorScreen
 from calib.bench.session import Session
 from calib.bench.state import REPORT, RESULT
+from calib.bench.web_console import WebConsole
 from calib.certificate import check_target, write
 from calib.lever_arms.gauge import convert
 from calib.messages import Message, english, message
@@ -43,15 +44,26 @@ def decide_alone(result: Result) -> bool:
     return all(mark != "bad" for mark, _ in verdict(result.identification))
 
 
-def ask_operator(unit: str, screen: OperatorScreen, keys: Keyboard, queue: QueueReader) -> bool:
+def ask_operator(
+    result: Result,
+    unit: str,
+    screen: OperatorScreen,
+    keys: Keyboard,
+    web: WebConsole | None,
+    queue: QueueReader,
+) -> bool:
     """Ask the operator whether to accept the result.
 
     Parameters
     ----------
+    result : Result
+        The result.
     unit : str
         Serial number.
     screen, keys
         The operator's terminal.
+    web : WebConsole or None
+        The operator's page.
     queue : QueueReader
         Emptied meanwhile; its samples are not needed.
 
@@ -69,8 +81,12 @@ def ask_operator(unit: str, screen: OperatorScreen, keys: Keyboard, queue: Queue
     while not screen.is_idle:
         queue.take()
     keys.read()  # keys pressed before the question are no answer to it
-    while (answer := keys.answer()) is None:
+    if web is not None:
+        web.ask(result)
+    while (answer := keys.answer()) is None and (web is None or (answer := web.answer()) is None):
         queue.take()
+    if web is not None:
+        web.decided()
     return answer
 
 

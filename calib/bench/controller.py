@@ -42,6 +42,7 @@ from calib.bench.resume import require_temperature
 from calib.bench.screen import OperatorScreen, with_port_state
 from calib.bench.session import Session
 from calib.bench.state import REPORT
+from calib.bench.web_console import PERIOD_S, WebConsole
 from calib.messages import Message, english, message
 from calib.procedure.engine import Engine
 from calib.procedure.events import (
@@ -92,6 +93,8 @@ class SessionController:
         unit then.
     watch : callable
         Called with each view; a simulated technician looks at it.
+    web : WebConsole or None
+        The operator's page, beside the terminal.
 
     Attributes
     ----------
@@ -116,6 +119,7 @@ class SessionController:
         accepts: bool,
         begin: Callable[[Procedure], None],
         watch: Callable[[View], None] = lambda _: None,
+        web: WebConsole | None = None,
     ) -> None:
         self.error: BaseException | None = None
         self.outcome: tuple[Message, ...] = ()
@@ -127,7 +131,7 @@ class SessionController:
         self._queue = QueueReader(queue, lambda text: session.append(ServiceMessage(text)))
         self._recordings = AttemptRecordings(session, service, self._queue)
         self._hands_free, self._accepts, self._begin = hands_free, accepts, begin
-        self._watch = watch
+        self._watch, self._web = watch, web
         self._is_unit_detected = False
         self._conditions = Conditions()
         self._conditions_ns = 0
@@ -191,11 +195,12 @@ class SessionController:
             summarise(result, self._screen)
             if self._accepts:
                 decision = Decision(decide_alone(result))
-            elif not self._keys.there:
+            elif not self._keys.there and self._web is None:
                 return None
             else:
                 unit = self._session.plan.unit
-                decision = Decision(ask_operator(unit, self._screen, self._keys, self._queue))
+                answer = ask_operator(result, unit, self._screen, self._keys, self._web, self._queue)
+                decision = Decision(answer)
             if decision.accepted:
                 self._session.append(decision)
         if not decision.accepted:
@@ -220,13 +225,18 @@ class SessionController:
         if last is None:
             self._begin(steps_left(procedure, accepted))
         try:
-            shown_s = 0.0
+            shown_s = web_s = 0.0
             while last is None:
                 batch = self._queue.next()
                 events = () if batch is None else self._feed(engine, batch)
                 is_due = time.monotonic() - shown_s >= REDRAW_S
                 if is_due and (shown := self._screen.shown) and (action := self._keys.action(shown)):
                     events += engine.handle(action)
+                if self._web is not None and time.monotonic() - web_s >= PERIOD_S:
+                    web_s = time.monotonic()
+                    if chosen := self._web.action(engine.view):
+                        events += engine.handle(chosen)
+                    self._web.show(with_port_state(engine.view, self._service.port_state))
                 last = self._apply_events(engine, events)
                 if events or is_due:
                     shown_s = time.monotonic()

@@ -1,8 +1,9 @@
 """`calib run`: a session from the command line, with a unit or a rehearsal."""
 
 import os
+import time
 from collections.abc import Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -24,6 +25,7 @@ from calib.bench.session import Session
 from calib.bench.simulated_unit import SimulatedUnitProcess, is_rehearsal
 from calib.bench.state import JOURNAL, REPORT, RESULT, WORKING_CERTIFICATE
 from calib.bench.technician import BENCH, mistakes_of
+from calib.bench.web_console import WebConsole
 from calib.certificate import lever_arms_of
 from calib.inputs import require_six_axes
 from calib.messages import Message, language, message, text
@@ -55,6 +57,9 @@ REHEARSAL_PROFILE: Final = "imu50-rs422"
 """Default profile of a rehearsal."""
 
 
+_LINGER_S: Final = 0.2
+
+
 QUEUE_LIMIT: Final = 1000
 """Samples that may wait for the engine in a rehearsal at full speed."""
 
@@ -82,6 +87,8 @@ class RunOptions:
         Use a simulated unit and technician, hands free.
     keys : bool
         A person presses the keys of the rehearsal, and the technician does what the screen says.
+    web : str or None
+        Address of a page for browsers, see `imudrv.web.server.PageServer`; its buttons are keys.
     mistakes : str
         Mistakes of the technician, see `calib.bench.technician.mistakes_of`.
     speed : str
@@ -104,6 +111,7 @@ class RunOptions:
     accept: bool = False
     rehearse: bool = False
     keys: bool = False
+    web: str | None = None
     mistakes: str = ""
     speed: str = "1"
     redo: Sequence[str] = ()
@@ -118,7 +126,9 @@ class RunOptions:
     @property
     def has_operator(self) -> bool:
         """Whether an operator presses keys."""
-        return self.keys if self.is_rehearsal else not self.hands_free
+        if self.hands_free:
+            return False
+        return not self.is_rehearsal or self.keys or self.web is not None
 
     def say(self, console: Console, what: Message) -> None:
         """Print a message in the language of the operator."""
@@ -155,7 +165,17 @@ def run(options: RunOptions, console: Console) -> int:
         console.print(_plan_text(options), markup=False, highlight=False, soft_wrap=True)
         return OK
     with closing(open_or_create(options, console)) as session:
-        return conduct(session, options, console)
+        if options.web is None:
+            return conduct(session, options, console)
+        with closing(WebConsole(session, options.web, language(options.language))) as web:
+            options.say(console, message("web_address", url=web.url))
+            code = conduct(session, options, console, web)
+            if web.viewers:
+                options.say(console, message("web_stays"))
+                with suppress(KeyboardInterrupt):
+                    while web.viewers:
+                        time.sleep(_LINGER_S)
+            return code
 
 
 def open_or_create(options: RunOptions, console: Console) -> Session:
@@ -168,7 +188,11 @@ def open_or_create(options: RunOptions, console: Console) -> Session:
     try:
         _require_resumable(session, options)
         resume(
-            session, console, options.redo, language(options.language), _ask if options.has_operator else None
+            session,
+            console,
+            options.redo,
+            language(options.language),
+            _ask if options.has_operator and Keyboard().there else None,
         )
     except BaseException:
         session.close()
@@ -176,7 +200,7 @@ def open_or_create(options: RunOptions, console: Console) -> Session:
     return session
 
 
-def conduct(session: Session, options: RunOptions, console: Console) -> int:
+def conduct(session: Session, options: RunOptions, console: Console, web: WebConsole | None = None) -> int:
     """Conduct an open session: the service runs in this thread, the controller in another; see `run`."""
     begun_with = session.plan
     simulated = None
@@ -219,6 +243,7 @@ def conduct(session: Session, options: RunOptions, console: Console) -> int:
         accepts=options.accept or (options.is_rehearsal and not options.has_operator),
         begin=begin,
         watch=(lambda _: None) if simulated is None else simulated.watch,
+        web=web,
     )
     worker = Thread(target=controller.run, name="controller")
     # From here on: an interrupt while compiled code is loaded could be lost or leave a lock behind.
@@ -242,6 +267,8 @@ def conduct(session: Session, options: RunOptions, console: Console) -> int:
         return NOT_GOOD if controller.is_undecided else INTERRUPTED
     for line in controller.outcome:
         options.say(console, line)
+    if web is not None:
+        web.end(controller.outcome)
     if simulated is not None:
         result = session.folder / RESULT
         found = lever_arms_of(read_calibration(result), str(result))
@@ -258,7 +285,7 @@ def _ask() -> bool:
 def _check(options: RunOptions, exists: bool) -> None:
     """Refuse options that do not fit together."""
     folder = options.folder
-    if options.has_operator and not Keyboard().there:
+    if options.has_operator and options.web is None and not Keyboard().there:
         raise InputError("expected a terminal for the operator's keys, got none; use one, or --hands-free")
     if options.is_rehearsal and (options.port or options.calibration or options.site):
         raise InputError("--rehearse: expected no --port, --calibration or --site; it has a unit of its own")

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
+from math import ceil
 from typing import Final
 
 from rich.console import Console, Group, RenderableType
@@ -88,16 +89,25 @@ _LINE_STATES: Final = {
 _WRAPS: Final = Console(color_system=None)
 
 
+_TONES: Final = {
+    Phase.PREFLIGHT: "do",
+    Phase.PLACE: "do",
+    Phase.SETTLE: "wait",
+    Phase.ALIGN: "wait",
+    Phase.ROTATE: "turn",
+    Phase.REST: "wait",
+    Phase.VERDICT: "good",
+    Phase.DONE: "good",
+    Phase.ABORTED: "bad",
+}
+
+
 _STYLES: Final = {
-    Phase.PREFLIGHT: "white on blue",
-    Phase.PLACE: "white on blue",
-    Phase.SETTLE: "black on yellow",
-    Phase.ALIGN: "black on yellow",
-    Phase.ROTATE: "white on magenta",
-    Phase.REST: "black on yellow",
-    Phase.VERDICT: "black on green",
-    Phase.DONE: "black on green",
-    Phase.ABORTED: "white on red",
+    "do": "white on blue",
+    "wait": "black on yellow",
+    "turn": "white on magenta",
+    "good": "black on green",
+    "bad": "white on red",
 }
 
 
@@ -161,8 +171,8 @@ def screen(
     top.add_row(Text(shown(view.title), "bold"), Text(shown(PHASES[view.phase]).upper(), "bold"))
     headline = () if language == "en" else (view.headline,)
     hints = _wrapped([*map(shown, (*headline, *view.hints))], width, _FEWEST, _MOST_HINTS)
-    reasons = _wrapped([*map(shown, _reasons(view))], width, _FEWEST, _MOST_REASONS)
-    last_try = _wrapped([shown(tried) for tried in _last_try(view)], width, 0, 1)
+    reasons = _wrapped([*map(shown, shown_reasons(view))], width, _FEWEST, _MOST_REASONS)
+    last_try = _wrapped([shown(tried) for tried in shown_last_try(view)], width, 0, 1)
     last = _keys(view.actions, language) if question is None else shown(question)
     figures = () if _is_rejected(view) else (_figures(view, width, ascii_only, language),)
     free = height - _OTHER_ROWS + _FIGURES * (not figures) - len(hints) - len(reasons) - len(last_try)
@@ -185,7 +195,9 @@ def plain(view: View, question: Message | None = None, language: str = "en") -> 
 
     phase = f"{shown(PHASES[view.phase])}: {shown(view.headline)}"
     parts = [shown(view.title), phase, *map(shown, view.hints)]
-    parts += [f"! {shown(why)}" for why in _reasons(view)] + [shown(tried) for tried in _last_try(view)]
+    parts += [f"! {shown(why)}" for why in shown_reasons(view)] + [
+        shown(tried) for tried in shown_last_try(view)
+    ]
     parts += [] if question is None else [f"! {shown(question)}"]
     return " | ".join(part for part in parts if part)
 
@@ -302,12 +314,21 @@ class OperatorScreen:
             self._live = None
 
 
+def tone(view: View) -> str:
+    """Return what a view asks for: 'do', 'wait', 'turn'; or how something went: 'good', 'bad'."""
+    refused = view.reasons and view.phase in (Phase.PREFLIGHT, Phase.VERDICT)
+    if refused or view.headline in (NO_DATA, NO_FRAMES, WRONG_RATE):
+        return "bad"
+    return "wait" if view.headline.key == "hands_off" else _TONES[view.phase]
+
+
 def large_text(view: View, language: str = "en") -> str:
     """Return the headline, with the remaining time where one has to wait."""
     headline, remaining_s = text(view.headline, language), view.remaining_s
     if view.headline.key != "hands_off" or remaining_s is None:
         return headline
-    return f"{headline} {int(remaining_s) // 60}:{int(remaining_s) % 60:02d}"
+    minutes, seconds = divmod(ceil(remaining_s), 60)
+    return f"{headline} {minutes}:{seconds:02d}"
 
 
 def _is_rejected(view: View) -> bool:
@@ -315,23 +336,18 @@ def _is_rejected(view: View) -> bool:
     return view.headline.key == "rejected"
 
 
-def _reasons(view: View) -> tuple[Message, ...]:
+def shown_reasons(view: View) -> tuple[Message, ...]:
     """Return the reasons to show: of a rejection one, which its hint remedies."""
     return view.reasons[:1] if _is_rejected(view) else view.reasons
 
 
-def _last_try(view: View) -> tuple[Message, ...]:
+def shown_last_try(view: View) -> tuple[Message, ...]:
     """Return why the last attempt was rejected."""
     return tuple(message("label_last_try", reason=reason) for reason in view.last_try[:1])
 
 
 def _banner(view: View, width: int, height: int, ascii_only: bool) -> RenderableType:
-    refused = view.reasons and view.phase in (Phase.PREFLIGHT, Phase.VERDICT)
-    style = (
-        "white on red"
-        if refused or view.headline in (NO_DATA, NO_FRAMES, WRONG_RATE)
-        else _STYLES[view.phase]
-    )
+    style = _STYLES[tone(view)]
     headline, inside = large_text(view), width - 2
     scale, lines = block_letters.fitted(headline, inside, height)
     if ascii_only and scale < 2:

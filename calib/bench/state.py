@@ -47,6 +47,10 @@ PROFILE: Final = "profile.yaml"
 LOCK: Final = ".lock"
 
 
+WEB_TOKEN: Final = ".web-token"
+"""Secret part of the address of the session's page."""
+
+
 Stage = TypeVar("Stage", Finished, Decision, SessionEnded)
 
 

@@ -19,6 +19,7 @@ from calib.bench.state import (
     LOCK,
     PROFILE,
     RESULT,
+    WEB_TOKEN,
     WORKING_CERTIFICATE,
     SessionState,
     require_session,
@@ -132,7 +133,13 @@ def _verify_session(folder: Path, trusted: Mapping[str, str] | None) -> Verified
     if not faults:
         faults = [*_disagreements(session), *_uncovered_steps(session)]
     notes = [f"{len(contents.entries)} lines and {len(files)} files checked"]
-    unknown = {path.name for path in folder.iterdir() if path.is_file()} - {*files, JOURNAL, LOCK, PROFILE}
+    unknown = {path.name for path in folder.iterdir() if path.is_file()} - {
+        *files,
+        JOURNAL,
+        LOCK,
+        PROFILE,
+        WEB_TOKEN,
+    }
     shown = (name if name.isprintable() else ascii(name) for name in sorted(unknown))
     notes += [f"{folder / name}: not in the journal, not checked" for name in shown]
     signed = {JOURNAL: contents.signature}

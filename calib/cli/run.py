@@ -7,6 +7,7 @@ from typing import Final
 from calib.bench.run import RunOptions, new_folder
 from calib.bench.run import run as run_session
 from calib.bench.technician import MISTAKES
+from calib.bench.web_console import ADDRESS
 from calib.procedure import plan
 from imudrv.cli.arguments import add_profile
 from imudrv.terminal import console
@@ -43,6 +44,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--accept", action="store_true", help=text)
     add("--language", metavar="L", help="en or zh_CN; default: the system's")
     add("--rehearse", action="store_true", help="use a simulated unit and technician")
+    text = f"a page for browsers, beside the terminal; default address: {ADDRESS}, for this machine only"
+    add("--web", nargs="?", const=ADDRESS, metavar="HOST:PORT", help=text)
     text = "in a rehearsal: you press the keys, and the technician does what the screen says"
     add("--keys", action="store_true", help=text)
     text = f"in a rehearsal: random, or some of {', '.join(k.replace(' ', '-') for k in MISTAKES)}, by commas"
