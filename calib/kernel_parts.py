@@ -6,7 +6,10 @@ from calib.detection.blocks import Block, BlockSums
 from calib.detection.tracking import AttitudeTracker, RestAverages, RotationTracker, StillnessDetector
 from calib.noise.pyramid import Pyramid
 from calib.noise.stretches import StretchSplitter
+from calib.sensors.motion import SAMPLE, integrate
+from calib.sensors.parameters import Parameters
 from imudrv.records import INCREMENTS, PULSES
+from imudrv.sim.path import minimum_jerk
 
 
 def detection() -> None:
@@ -31,3 +34,12 @@ def noise() -> None:
     splitter.feed(np.ones(1, PULSES))
     pyramid.feed(*splitter.close())
     pyramid.end_stretch()
+
+
+def sensors() -> None:
+    """Motions between rests."""
+    samples = np.zeros(3, SAMPLE)
+    samples["T"] = 1e-3
+    still = np.zeros(3), np.zeros(3)
+    integrate(samples, Parameters(9.8, np.zeros(2)), still, still)
+    minimum_jerk(0.5)

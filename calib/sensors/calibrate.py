@@ -248,6 +248,7 @@ def solve(
         leave_one_out=leave_one_out(found, options.free, gravity_sigma),
     )
     verdict = [
+        *_unplanned(result.poses, procedure),
         *judge(found, result.estimates, evidence, result.poses),
         *extra,
         *gravity_judgement(site, gravity_sigma),
@@ -265,6 +266,14 @@ def solve(
             )
         )
     return replace(result, verdict=tuple(verdict))
+
+
+def _unplanned(poses: Sequence[str], procedure: Procedure | None) -> Iterator[Judgement]:
+    """Yield the sentence on poses that were planned and are not there."""
+    planned = dict(_planned(procedure)) if procedure else {}
+    absent = [name for name in planned if name not in poses]
+    if absent:
+        yield Judgement("note", f"Planned and not found: {', '.join(absent)}.")
 
 
 def _missing(result: SensorsResult) -> Iterator[str]:
@@ -361,17 +370,24 @@ def _require_fixed_pivot(
         )
 
 
+def _planned(procedure: Procedure) -> Iterator[tuple[str, Array]]:
+    """Yield name and attitude C_bn of each planned rest; those of a rotation are one pose."""
+    for rest in procedure.rests:
+        yield rest.id, rest.C_bn
+    for step in procedure.steps:
+        yield step.id, step.C_bn
+        yield step.id, step.C_bn @ np.diag([-1.0, -1.0, 1.0])
+
+
 def named_poses(attitudes: Sequence[Array], procedure: Procedure | None) -> tuple[str, ...]:
     """Return the name of each rest: that of the nearest pose planned, or the axis that is up."""
     names = []
     for C_nb in attitudes:
         name = pose_of(C_nb)
         if procedure is not None:
-            steps = [(rest.id, rest.C_bn) for rest in procedure.rests]
-            turned = [(id_, C_bn @ np.diag([-1.0, -1.0, 1.0])) for id_, C_bn in steps]
-            near = {id_: angle(C_nb @ C_bn) for id_, C_bn in [*turned, *steps]}
-            planned = min(near, key=lambda id_: near[id_])
-            if near[planned] < NEAR_POSE:
+            near = [(angle(C_nb @ C_bn), planned) for planned, C_bn in _planned(procedure)]
+            distance, planned = min(near)
+            if distance < NEAR_POSE:
                 name = planned
         names.append(name)
     return tuple(names)

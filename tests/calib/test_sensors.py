@@ -1,5 +1,6 @@
 """Calibration of the sensors: simulated units by hand against their truth, and inputs that are not right."""
 
+import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -7,20 +8,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calib.cli import main
+from calib.sensors.adjustment import Free
 from calib.sensors.calibrate import SensorsOptions, calibrate_sensors
 from calib.sensors.certificate import certificate, result_document
 from calib.sensors.parameters import NominalScales
+from calib.sensors.prediction import PlannedPose, additions, predict_sensors, turned
 from calib.sensors.rests import read_evidence
 from calib.sensors.result import SensorsResult
 from imudrv import profiles
 from imudrv.calibration import Calibration, read_calibration, write_calibration
 from imudrv.errors import InputError
+from imudrv.files import settings_file
 from imudrv.nav.attitude import rotation
 from imudrv.records import Flag, Records
 from imudrv.sensor_calibration import number_paths
 from imudrv.units import ARCSEC
 from imudrv.wire.encode import StreamEncoder
-from tools.sensors_units import SITE, SimulatedUnit, new_unit, pulses_of, six_faces_turned
+from tools.sensors_units import FACES, SITE, SimulatedUnit, new_unit, pulses_of, six_faces_turned
 
 PROFILE = profiles.load("imu50-rs422").model_copy(update={"sample_rate_hz": 100.0})
 LAYOUT = PROFILE.layout()
@@ -522,3 +527,119 @@ def test_the_same_capture_twice_is_refused(solve, session):
         InputError, match=r"session-1\.raw: expected another capture, got that of session-0\.raw once more"
     ):
         solve(session, session)
+
+
+# The command
+
+
+@pytest.fixture
+def here(session: Records, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a session, its site and its profile, as the current one."""
+    (tmp_path / "session.raw").write_bytes(StreamEncoder(LAYOUT).encode(session).tobytes())
+    settings_file.write(tmp_path / "site.yaml", SITE)
+    text = (Path(profiles.__file__).parent / "imu50-rs422.yaml").read_text()
+    (tmp_path / "slow.yaml").write_text(re.sub("sample_rate_hz: .*", "sample_rate_hz: 100", text))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+COMMAND = ("sensors", "session.raw", "--profile", "slow.yaml", "--site", "site.yaml", "--unit", UNIT)
+
+
+def test_the_command_writes_certificate_report_and_json(here, capsys):
+    (here / "plan.yaml").write_text(PLAN)
+    outputs = ["-o", "unit.yaml", "--json", "r.json", "--report", "r.html", "--procedure", "plan.yaml"]
+    assert main([*COMMAND, *outputs]) == 0
+    text = capsys.readouterr().out
+    assert "12 rests and 11 motions; 34 of 34 numbers are observable" in text
+    assert "Planned and not found: z-tilted." in text
+    assert re.search(r"x-up +\d+\.\d +\d\d\.\d", text)
+    assert "unit.yaml: certificate of unit 50-0017" in text
+    document = json.loads((here / "r.json").read_text())
+    assert document["certificate"] is True
+    assert [one["pose"] for one in document["sensors"]["rests"]][:2] == ["z-up", "z-up"]
+    page = (here / "r.html").read_text()
+    assert page.count("data:image/svg+xml") == 3  # residuals, attitudes, temperatures
+    assert read_calibration("unit.yaml").serial_number == UNIT
+    assert main([*COMMAND, "-o", "unit.yaml", "--start", "unit.yaml"]) == 0  # the older one is kept
+    assert len(list(here.glob("unit*.yaml"))) == 2
+
+
+PLAN = """
+format: imu50-procedure
+version: 1
+name: some poses
+poses:
+  - {id: z-up, up: +Z, east: +X, turn_deg: 180}
+  - {id: x-up, up: +X, east: +Y, turn_deg: 180}
+  - {id: z-tilted, up: +Z, east: +Y, turn_deg: 180}
+"""
+
+
+def test_a_bad_verdict_has_its_own_exit_code_and_leaves_the_report(here, session, capsys):
+    spoilt = swapped(session, "gyro", [0, 1, 2], [1, -1, 1])
+    (here / "session.raw").write_bytes(StreamEncoder(LAYOUT).encode(spoilt).tobytes())
+    assert main([*COMMAND, "-o", "unit.yaml", "--report", "r.html", "--json", "r.json"]) == 3
+    assert "unit.yaml: no certificate: Gyro Y is reversed" in capsys.readouterr().out
+    assert not (here / "unit.yaml").exists()
+    assert "Gyro Y is reversed" in (here / "r.html").read_text()
+    assert json.loads((here / "r.json").read_text())["certificate"] is False
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (["--without", "bias"], "--without: expected quadratic or skew, got bias"),
+        (
+            ["--start", "other.yaml"],
+            "--start: expected the calibration of unit '50-0017', got that of '50-0018'",
+        ),
+        (["--procedure", "nothing"], "nothing"),
+    ],
+)
+def test_a_wrong_option_is_refused(here, capsys, more, words):
+    other = new_unit(1, LAYOUT).scenario.unit.calibration
+    write_calibration(here / "other.yaml", other.model_copy(update={"serial_number": "50-0018"}))
+    assert main([*COMMAND, "-o", "unit.yaml", *more]) == 2
+    assert words in capsys.readouterr().err
+
+
+# The plan
+
+
+def test_the_plan_predicts_the_uncertainty_that_is_stated_then(result):
+    poses = [pose for up, east in FACES for pose in (PlannedPose(up, east), turned(PlannedPose(up, east)))]
+    planned = predict_sensors([poses], site=SITE, rest_s=REST_S)
+    assert (planned.rank, planned.unknowns) == (31, 31)
+    stated = {one.path: one.sigma for one in result.estimates if one.is_shown}
+    ratios = np.array(
+        [
+            sigma / stated[one.path]
+            for one, sigma in zip(planned.numbers, planned.sigma, strict=True)
+            if one.path in stated
+        ]
+    )
+    # the scales are nominal there; wander, and how the hand moves, differ
+    assert 0.6 < ratios.min() < ratios.max() < 1.6
+
+
+@pytest.mark.parametrize(
+    ("poses", "rank"),
+    [
+        (
+            [[("+Z", "+X")], [("-Z", "-X")], [("+X", "+Y")], [("-X", "-Y")], [("+Y", "+Z")], [("-Y", "-Z")]],
+            12,
+        ),
+        ([[("+Z", "+X"), ("+Z", "+Y"), ("+Z", "-X"), ("+Z", "-Y")]], 18),
+    ],
+)
+def test_a_plan_that_shows_little_says_so(poses, rank):
+    sessions = [[PlannedPose(*pose) for pose in session] for session in poses]
+    planned = predict_sensors(sessions, site=SITE)
+    assert abs(planned.rank - rank) <= 1  # of 31
+    lacking = set(planned.not_observable)
+    assert {"accelerometer.quadratic_ug_per_g2[0]", "accelerometer.C_ba[0][2]"} <= lacking
+    attitudes = [[pose.C_nb for pose in session] for session in sessions]
+    found = list(additions(attitudes, planned.not_observable, site=SITE, rest_s=60.0, free=Free()))
+    assert "turn" in found[0].text
+    assert set().union(*(one.paths for one in found)) == lacking  # three of them show everything
