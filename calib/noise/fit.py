@@ -130,20 +130,29 @@ def _fit(tau_s: Array, variance: Array, independent: Array, estimates: Estimates
         if round_ and norm**2 > HOPELESS * degrees:
             break
         covariance = estimates.matrix(squares)
-    sigma = np.sqrt(np.diag(np.linalg.inv(whitened.T @ whitened))) / size
-    observable = squares > SIGMAS * sigma
+    sigma = _sigma(whitened) / size
+    observable = squares > SIGMAS * sigma  # beside all other kinds, also those that are not there
+    below = np.sqrt(squares + QUANTILE_95 * sigma)
+    present = squares > 0.0
+    sigma[present] = _sigma(whitened[:, present]) / size[present]
     observable[B] &= np.argmin(variance) < len(variance) - 1  # it may fall further
     value = np.sqrt(np.where(observable, squares, np.nan))
     return Fit(
         tau_s,
         value,
         sigma / (2.0 * value),
-        np.sqrt(squares + QUANTILE_95 * sigma),
+        below,
         squares,
         np.sqrt(np.diag(covariance)) / (2.0 * np.sqrt(variance)),
         float(norm**2),
         degrees,
     )
+
+
+def _sigma(whitened: Array) -> Array:
+    """Return the standard uncertainties of the parameters of whitened equations."""
+    sigma: Array = np.sqrt(np.diag(np.linalg.inv(whitened.T @ whitened)))
+    return sigma
 
 
 def _root(covariance: Array) -> Array:
