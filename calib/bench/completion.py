@@ -1,19 +1,26 @@
 """After the steps: result, the operator's decision, activation of the certificate, and report."""
 
+from collections.abc import Iterator
 from typing import Final
 
 from calib.bench.entries import Decision
+from calib.bench.journal import journal_dates
 from calib.bench.keys import Keyboard
 from calib.bench.queue_sink import QueueReader
 from calib.bench.result import Result, identify_session
 from calib.bench.screen import OperatorScreen
 from calib.bench.session import Session
-from calib.bench.state import REPORT, RESULT
+from calib.bench.simulated_unit import is_rehearsal
+from calib.bench.state import JOURNAL, REPORT, RESULT
 from calib.bench.web_console import WebConsole
 from calib.certificate import check_target, write
 from calib.lever_arms.gauge import convert
 from calib.messages import Message, english, message
-from calib.reports.identification import arms_text, report_html
+from calib.procedure.events import Rejected, Skipped
+from calib.reports.certificate import Particulars
+from calib.reports.certificate import document as certificate_document
+from calib.reports.html import as_html
+from calib.reports.identification import arms_text
 from calib.reports.verdict import verdict
 from imudrv.calibration import Calibration, read_calibration
 from imudrv.errors import InputError
@@ -149,10 +156,34 @@ def write_report(session: Session, result: Result, verified: Message | None = No
         Outcome of the verification; None: it is not done yet.
     """
     verified = message("verification_due") if verified is None else verified
-    arms = result.identification.arms
-    html = report_html(result.identification, (arms, convert(arms, "x")))
-    text = f"One more rotation with the new certificate: {english(verified)}."
-    section = f"<section>\n<h2>Verification</h2>\n<p>{text}</p>\n</section>"
+    arms, identification = result.identification.arms, result.identification
+    plan, simulated = session.plan, is_rehearsal(session.folder)
+    dates = journal_dates(session.folder / JOURNAL)
+    particulars = Particulars(
+        number=f"{plan.unit}-{identification.created:%Y%m%d}-{session.files[RESULT][:8]}",
+        bench=session.bench(),
+        operator=plan.operator or session.bench().operator,
+        procedure=f"{session.procedure().name}, SHA-256 {plan.procedure.sha256[:16]}, {plan.software}",
+        measured=" to ".join(dict.fromkeys(dates)),
+        attempts=tuple(_deviations(session)),
+        verified=verified,
+        is_simulated=simulated,
+    )
+    page = as_html(
+        certificate_document(identification, (arms, convert(arms, "x")), particulars),
+        number=particulars.number,
+        watermark="SIMULATED" if simulated else "",
+    )
     with atomic_write(session.path(REPORT)) as file:
-        file.write(html.replace("</section>", f"</section>\n{section}", 1).encode())
+        file.write(page.encode())
     session.record_file(REPORT)
+
+
+def _deviations(session: Session) -> Iterator[tuple[str, str]]:
+    """Return rejected attempts and skipped steps, and why."""
+    for entry in session.entries:
+        if isinstance(entry, Rejected):
+            why = "; ".join(map(english, entry.reasons))
+            yield f"rejected: {entry.step_id}, attempt {entry.attempt}", why
+        elif isinstance(entry, Skipped):
+            yield f"skipped: {entry.step_id}", "by the operator"

@@ -128,6 +128,10 @@ class Plan:
         The unit's active certificate.
     procedure, site, profile : EmbeddedFile
         What is done, where, and the wire format of the unit.
+    bench : EmbeddedFile or None
+        Who calibrates, where and with what; None if there is no such file, and in older journals.
+    operator : str
+        Who conducts the session; empty if unknown.
     """
 
     format: Literal["imu50-session"]
@@ -139,6 +143,8 @@ class Plan:
     procedure: UndamagedFile
     site: UndamagedFile
     profile: UndamagedFile
+    bench: UndamagedFile | None = None
+    operator: Line = ""
 
 
 @dataclass(frozen=True)

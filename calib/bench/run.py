@@ -31,13 +31,16 @@ from calib.inputs import require_six_axes
 from calib.messages import Message, language, message, text
 from calib.procedure import plan
 from calib.procedure.schema import Procedure
+from calib.reports.pdf import renderer, write_pdf
 from calib.reports.text import as_text
 from calib.reports.truth import comparison
 from calib.sensors import plan as sensors_plan
 from imudrv import profiles
+from imudrv.bench import BENCH_FILE, Bench
 from imudrv.calibration import coefficients, read_calibration
 from imudrv.errors import InputError
 from imudrv.files import settings_file
+from imudrv.files.config_folder import config_file
 from imudrv.imu.compensation import require_sensors
 from imudrv.service.endpoint import default_folder
 from imudrv.service.loop import Service
@@ -93,6 +96,12 @@ class RunOptions:
         Mistakes of the technician, see `calib.bench.technician.mistakes_of`.
     speed : str
         Speed of the rehearsal: a number, or ``max``.
+    pdf : bool
+        Write the report as PDF, too.
+    bench : Path or None
+        Bench file of a new session; None: that of the user's configuration, if there is one.
+    operator, unit : str or None
+        Who conducts a new session, and the serial number on the unit; asked at a terminal if not given.
     redo : sequence of str
         Steps of an existing session to do again.
     plan : bool
@@ -114,6 +123,10 @@ class RunOptions:
     web: str | None = None
     mistakes: str = ""
     speed: str = "1"
+    pdf: bool = False
+    bench: Path | None = None
+    operator: str | None = None
+    unit: str | None = None
     redo: Sequence[str] = ()
     plan: bool = False
     language: str | None = None
@@ -269,6 +282,10 @@ def conduct(session: Session, options: RunOptions, console: Console, web: WebCon
         options.say(console, line)
     if web is not None:
         web.end(controller.outcome)
+    report = session.folder / REPORT
+    if options.pdf and REPORT in session.files:
+        write_pdf(report, report.with_suffix(".pdf"))
+        options.say(console, message("report", path=str(report.with_suffix(".pdf"))))
     if simulated is not None:
         result = session.folder / RESULT
         found = lever_arms_of(read_calibration(result), str(result))
@@ -295,6 +312,8 @@ def _check(options: RunOptions, exists: bool) -> None:
         mistakes_of(options.mistakes, plan.load(options.procedure or PROCEDURE), np.random.default_rng())
     if exists and options.rehearse and not is_rehearsal(folder):
         raise InputError(f"{folder}: --rehearse: expected a rehearsal to resume, got the session of a unit")
+    if options.pdf:
+        renderer()
     if options.redo and not exists:
         raise InputError(f"--redo: expected an existing session, with --session, got none in {folder}")
 
@@ -330,6 +349,9 @@ def _create(options: RunOptions, console: Console) -> Session:
         raise incomplete
     require_sensors(coefficients(read_calibration(calibration)), layout)
     place = settings_file.read_file(site, Site)
+    bench_path = _bench_path(options)
+    bench = None if bench_path is None else settings_file.read_file(bench_path, Bench)
+    operator = _operator(options, console, read_calibration(calibration).serial_number, bench)
     worst_mm = float(plan.predicted(procedure.model, place.model).differences_sigma.max()) / MM
     minutes = plan.duration_s(procedure.model) / 60.0
     options.say(console, message("expected", folder=str(folder), minutes=minutes, worst_mm=worst_mm))
@@ -340,7 +362,34 @@ def _create(options: RunOptions, console: Console) -> Session:
         site=EmbeddedFile.of(site, place.content),
         profile=profile,
         port=port,
+        bench=None if bench is None else EmbeddedFile.of(str(bench_path), bench.content),
+        operator=operator,
     )
+
+
+def _bench_path(options: RunOptions) -> Path | None:
+    """Return the bench file, if there is one."""
+    if options.bench is not None:
+        return options.bench
+    default = config_file(BENCH_FILE)
+    return default if default is not None and default.is_file() else None
+
+
+def _operator(
+    options: RunOptions, console: Console, unit: str, bench: settings_file.SettingsFile[Bench] | None
+) -> str:
+    """Return the operator; refuse another unit than that of the certificate; ask for what is not given."""
+    asks = options.has_operator and not options.is_rehearsal and Keyboard().there
+    serial, operator = options.unit, options.operator
+    if serial is None and asks:
+        options.say(console, message("ask_unit"))
+        serial = console.input().strip()  # a scanner types, too
+    if serial is not None and serial != unit:
+        raise InputError(f"expected unit {unit!r} of the certificate, got {serial!r}; connect that unit")
+    if operator is None and asks:
+        options.say(console, message("ask_operator"))
+        operator = console.input().strip()
+    return operator or ("" if bench is None else bench.model.operator)
 
 
 def _require_resumable(session: Session, options: RunOptions) -> None:

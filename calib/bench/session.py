@@ -86,6 +86,8 @@ class Session(SessionState):
         site: EmbeddedFile,
         profile: str,
         port: str,
+        bench: EmbeddedFile | None = None,
+        operator: str = "",
     ) -> Self:
         """Create a session in a new folder.
 
@@ -101,6 +103,10 @@ class Session(SessionState):
             Name or path of the profile.
         port : str
             Port of the unit.
+        bench : EmbeddedFile, optional
+            Who calibrates, where and with what; already checked.
+        operator : str
+            Who conducts the session.
 
         Returns
         -------
@@ -123,6 +129,8 @@ class Session(SessionState):
             procedure=procedure,
             site=site,
             profile=EmbeddedFile.of(profile, profiles.content(profile)),
+            bench=bench,
+            operator=operator,
         )
         try:
             folder.mkdir(parents=True, exist_ok=True)

@@ -56,7 +56,7 @@ def scatter_and_redundancy(
     Returns
     -------
     tuple of ChiSquare
-        Scatter, or None, and redundancy.
+        Scatter, or None if it cannot be tested on its own, and redundancy.
     """
     if in_motion:
         freedom = system.count - basis.shape[1] - _determined(system, covariance)
@@ -65,10 +65,10 @@ def scatter_and_redundancy(
     scatter = system.chi_square(free)
     all_turns = sum(len(part.accepted) for part in system.parts)
     redundant = max(0, 2 * len(system.turns) - basis.shape[1])
+    freedom = system.count - 2 * all_turns - _determined(system, spread)
     return (
-        ChiSquare(
-            scatter, system.count - 2 * all_turns - _determined(system, spread), noise.degrees_of_freedom
-        ),
+        # level accelerometers that send hardly a pulse are read at the ends of the rests alone
+        ChiSquare(scatter, freedom, noise.degrees_of_freedom) if freedom > 0 else None,
         ChiSquare(system.chi_square(x) - scatter if redundant else 0.0, redundant),
     )
 

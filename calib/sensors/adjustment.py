@@ -53,8 +53,8 @@ LARGER_WANDER: Final = 2.0
 AT_CEILING: Final = 0.999
 CHI_SQUARE_95: Final = 3.84
 """Wander at its ceiling is too large if twice as much explains the residuals significantly better."""
-WANDER_ITERATION: Final = 4
-"""Iteration in which the size of the wander is found, near the end; it is kept from then on."""
+NEARLY: Final = 1e-2
+"""Largest step of a parameter, in its sigma, after which the size of the wander is found, and kept."""
 CONVERGED: Final = 1e-4
 """Largest step of a parameter, in its sigma, at which the iteration ends."""
 
@@ -197,13 +197,13 @@ def adjust(
     wander = Wander(0.0, 0.0)
     Z = _whole_basis(free, len(attitudes))
     moved = np.zeros(Z.shape[1])
+    settled, largest = False, np.inf
     for iteration in range(1, MOST_ITERATIONS + 1):
         system = equations.system(p, attitudes)
         if not np.isfinite(system.residual).all():
             raise NoConvergence("the adjustment does not converge: its numbers grow without bounds")
-        settled = iteration > WANDER_ITERATION
-        if iteration == WANDER_ITERATION:
-            wander = _wander(system, Z, p, site_gravity, gravity_sigma)
+        if not settled and largest < NEARLY:
+            settled, wander = True, _wander(system, Z, p, site_gravity, gravity_sigma)
         solver = _Solver(system, Z, p, site_gravity, gravity_sigma, wander)
         step = solver.step(moved)
         moved = moved + step

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
+from datetime import UTC, datetime
 from io import StringIO
 from pathlib import Path
 from threading import Thread
@@ -443,7 +444,7 @@ def test_a_restart_of_the_unit_between_steps_is_noted(
 def found(monkeypatch: pytest.MonkeyPatch) -> None:
     """A result without recordings."""
 
-    nothing: Any = SimpleNamespace(arms=None)
+    nothing: Any = SimpleNamespace(arms=None, created=datetime(2026, 1, 1, tzinfo=UTC))
     monkeypatch.setattr(completion, "identify_session", lambda _: Result(nothing, NOMINAL))
     monkeypatch.setattr(controllers, "summarise", lambda *_: None)
 
@@ -474,7 +475,8 @@ def test_the_report_is_there_and_named_once_the_result_is_accepted(
 ) -> None:
     monkeypatch.setattr(controllers, "REDRAW_S", 0.0)
     monkeypatch.setattr(controllers, "decide_alone", lambda _: True)
-    monkeypatch.setattr(completion, "report_html", lambda *_: "<section></section>")
+    monkeypatch.setattr(completion, "certificate_document", lambda *given: str(given[2].verified.key))
+    monkeypatch.setattr(completion, "as_html", lambda text, **_: text)
     monkeypatch.setattr(completion, "convert", lambda *_: None)
     keys = Typed(lambda seen: "y" if "[y/n]" in seen else "q" if "Y up" in seen else "")
     conduct, text = conducted(session, list(batches), keys, stopped=False)
@@ -482,7 +484,7 @@ def test_the_report_is_there_and_named_once_the_result_is_accepted(
     assert conduct.outcome == ()  # the verification was aborted
     assert f"active certificate: {session.plan.certificate.path}" in text
     assert f"report: {session.folder / 'report.html'}" in text
-    assert "not done yet" in (session.folder / "report.html").read_text()
+    assert (session.folder / "report.html").read_text() == "verification_due"
 
 
 def test_nothing_is_decided_after_ctrl_c(session: Session, batches: list[Batch], found: None) -> None:
