@@ -2,6 +2,8 @@
 
 import asyncio
 import json
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -9,7 +11,9 @@ from typing import Any
 import pytest
 from realtime import until
 
+from imudrv.calibration import write_calibration
 from imudrv.errors import InputError
+from imudrv.sim.scenario import NOMINAL
 
 aiohttp = pytest.importorskip("aiohttp")
 
@@ -168,3 +172,55 @@ def test_files_outside_the_page_are_not_served(served: Served) -> None:
             return found
 
     assert run(statuses()) == [404, 404, 403, 404, 200]
+
+
+def test_the_monitor_serves_status_frames_of_a_running_service(tmp_path: Path) -> None:
+    head = "{format: imu50-scenario, version: 1, seed: 1, motion: [{rest: {duration_s: 3600}}],"
+    site = "site: {latitude_deg: 28, longitude_deg: 113, height_m: 60}}"
+    (tmp_path / "rest.yaml").write_text(head + site)
+    write_calibration(tmp_path / "unit.yaml", NOMINAL)
+    status = tmp_path / "status.sock"
+    serve = ["run", "--port", "sim://rest.yaml", "--profile", "imu50-rs422", "--calibration", "unit.yaml"]
+    commands = [
+        [*serve, "--status", str(status)],
+        ["monitor", "--status", str(status), "--web", "127.0.0.1:0"],
+    ]
+    processes = []
+
+    def start(command: list[str]) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "imudrv", *command], cwd=tmp_path, stdout=subprocess.PIPE, text=True
+        )
+        processes.append(process)
+        return process
+
+    async def frame(url: str) -> dict[str, Any]:
+        base, _, query = url.partition("/?")
+        headers, address = {"Origin": base}, f"{base}/ws?{query}"
+        async with aiohttp.ClientSession() as session, session.ws_connect(address, headers=headers) as page:
+            while (content := await page.receive_json())["kind"] != "status":
+                assert content["kind"] == "acting"
+            return content
+
+    try:
+        start(commands[0])
+        until(status.exists)
+        monitor = start(commands[1])
+        assert monitor.stdout is not None
+        url = monitor.stdout.readline().partition("page for browsers: ")[2].strip()
+        shown = run(frame(url))
+    finally:
+        for process in processes:
+            process.kill()
+            process.communicate()
+    assert {name for name, _, _ in shown["rows"]} >= {
+        "unit",
+        "port",
+        "rate",
+        "losses",
+        "clock",
+        "latency",
+        "BIT",
+    }
+    assert 8.0 < shown["force"] < 12.0  # gravity, with the noise of one sample
+    assert shown["rate"] < 2.0  # a pulse is 0.14 deg/s
