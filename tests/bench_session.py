@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.bench.entries import AcceptedStep, EmbeddedFile, from_json
+from calib.bench.identity import UNKNOWN, Identity
 from calib.bench.session import Session
 from imudrv.calibration import write_calibration
 from imudrv.files import settings_file
@@ -41,10 +42,12 @@ def embedded(path: Path) -> EmbeddedFile:
     return EmbeddedFile.of(path, path.read_bytes())
 
 
-def begin(folder: Path, profile: str = "imu50-rs422") -> Session:
+def begin(
+    folder: Path, profile: str = "imu50-rs422", unit: str = NOMINAL.serial_number, who: Identity = UNKNOWN
+) -> Session:
     """A session whose unit's files are beside it."""
     papers = folder.parent
-    write_calibration(papers / "unit.yaml", NOMINAL)
+    write_calibration(papers / "unit.yaml", NOMINAL.model_copy(update={"serial_number": unit}))
     settings_file.write(papers / "site.yaml", Site(latitude_deg=28.2, longitude_deg=113.0, height_m=60.0))
     (papers / "bench.yaml").write_text(PROCEDURE)
     return Session.create(
@@ -54,6 +57,7 @@ def begin(folder: Path, profile: str = "imu50-rs422") -> Session:
         site=embedded(papers / "site.yaml"),
         profile=profile,
         port="/dev/ttyUSB0",
+        who=who,
     )
 
 

@@ -14,6 +14,7 @@ from rich.console import Console
 
 from calib.bench.controller import SessionController
 from calib.bench.entries import EmbeddedFile
+from calib.bench.identity import identity
 from calib.bench.keys import Keyboard
 from calib.bench.queue_sink import QueueSink
 from calib.bench.resume import check_files, require_same, resume
@@ -80,6 +81,8 @@ class RunOptions:
         Steps of an existing session to do again.
     plan : bool
         Only show the procedure and its expected accuracy.
+    bench, operator : str or None
+        Names for the record of a new session; None: as they were given last.
     """
 
     folder: Path
@@ -93,6 +96,8 @@ class RunOptions:
     speed: str = "1"
     redo: Sequence[str] = ()
     plan: bool = False
+    bench: str | None = None
+    operator: str | None = None
 
     @property
     def is_rehearsal(self) -> bool:
@@ -271,6 +276,7 @@ def _create(options: RunOptions, console: Console) -> Session:
         site=EmbeddedFile.of(site, place.content),
         profile=profile,
         port=port,
+        who=identity(options.bench, options.operator, keep=not options.is_rehearsal),
     )
 
 

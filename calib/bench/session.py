@@ -32,6 +32,7 @@ from calib.bench.entries import (
     Plan,
     SessionEnded,
 )
+from calib.bench.identity import UNKNOWN, Identity
 from calib.bench.journal import Journal
 from calib.bench.state import (
     INITIAL_CERTIFICATE,
@@ -86,6 +87,7 @@ class Session(SessionState):
         site: EmbeddedFile,
         profile: str,
         port: str,
+        who: Identity = UNKNOWN,
     ) -> Self:
         """Create a session in a new folder.
 
@@ -101,6 +103,8 @@ class Session(SessionState):
             Name or path of the profile.
         port : str
             Port of the unit.
+        who : Identity
+            Who works on which bench.
 
         Returns
         -------
@@ -123,6 +127,7 @@ class Session(SessionState):
             procedure=procedure,
             site=site,
             profile=EmbeddedFile.of(profile, profiles.content(profile)),
+            **who._asdict(),
         )
         try:
             folder.mkdir(parents=True, exist_ok=True)

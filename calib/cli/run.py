@@ -33,6 +33,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="only show the steps, how long they take, and the expected accuracy",
     )
+    text = "name of this bench, and of its operator, for the record; kept for later sessions"
+    add("--bench", metavar="NAME", help=text)
+    add("--operator", metavar="NAME", help="see --bench")
     add("--hands-free", action="store_true", help="continue by the sensors alone, without keys")
     add("--rehearse", action="store_true", help="use a simulated unit and technician")
     add("--speed", default="1", metavar="X", help="speed of the rehearsal: 1, 10, ... or max")
