@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     benches = actions.add_parser("benches", help=text, description=text)
     text = "write all results as one table"
     export = actions.add_parser("export", help=text, description=text)
-    export.add_argument("--to", choices=("csv", "parquet"), required=True, help="format")
+    export.add_argument("--to", choices=("parquet",), required=True, help="format")
     export.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="file to write")
     for action in (index, drift, benches, export):
         action.add_argument(
