@@ -38,7 +38,8 @@ MAX_COUNTER: Final = 1 << 53
 """Largest counter: exact in every JSON reader, and 285 000 years at 1 kHz."""
 
 
-def _printable(text: str) -> str:
+def printable(text: str) -> str:
+    """Return the text; raise `ValueError` if it is not printable."""
     if not text.isprintable():
         raise ValueError(f"expected printable text, got {text[:60]!r}")
     return text
@@ -61,7 +62,7 @@ Counter = Annotated[int, Key(ge=-1, le=MAX_COUNTER)]
 Count = Annotated[int, Key(ge=0, le=MAX_COUNTER)]
 Digest = Annotated[str, Key(pattern=r"^[0-9a-f]{64}$")]
 """SHA-256, hexadecimal."""
-Line = Annotated[str, Key(max_length=4096), AfterValidator(_printable)]
+Line = Annotated[str, Key(max_length=4096), AfterValidator(printable)]
 """Text that is printed in messages."""
 FileName = Annotated[str, Key(max_length=255), AfterValidator(_file_name)]
 """Name of a file in the session's folder; no path."""
@@ -132,6 +133,8 @@ class Plan:
         Who calibrates, where and with what; None if there is no such file, and in older journals.
     operator : str
         Who conducts the session; empty if unknown.
+    host : str
+        Name of the computer; empty in older journals.
     """
 
     format: Literal["imu50-session"]
@@ -145,6 +148,7 @@ class Plan:
     profile: UndamagedFile
     bench: UndamagedFile | None = None
     operator: Line = ""
+    host: Line = ""
 
 
 @dataclass(frozen=True)
@@ -286,7 +290,7 @@ _KINDS: Final = {name: kind for kind, name in _NAMES.items()}
 
 
 _OF_ENGINE: Final[Mapping[str, Any]] = {
-    "step_id": Annotated[str, Key(max_length=64), AfterValidator(_printable)],
+    "step_id": Annotated[str, Key(max_length=64), AfterValidator(printable)],
     "attempt": Annotated[int, Key(ge=0, le=1_000_000)],
     "counter": Counter,
     "first_counter": Count,

@@ -17,6 +17,7 @@ end of the journal.
 
 import hashlib
 import os
+import platform
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -131,6 +132,7 @@ class Session(SessionState):
             profile=EmbeddedFile.of(profile, profiles.content(profile)),
             bench=bench,
             operator=operator,
+            host=platform.node()[:64],
         )
         try:
             folder.mkdir(parents=True, exist_ok=True)

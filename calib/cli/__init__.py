@@ -20,6 +20,7 @@ COMMANDS: Final = {
         "Calibrate the sensors of a unit from rests in several poses and the motions between them; exit "
         "code 3 if the verdict is bad."
     ),
+    "fleet": "Index many sessions, and find units that drift and benches that are off.",
     "identify": "Identify lever arms from captures of rotations: certificate and report.",
     "noise": (
         "Compute the noise of a unit from a long rest: Allan deviations and their coefficients; "
