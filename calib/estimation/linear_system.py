@@ -2,11 +2,11 @@
 
 **Noise.** The readings of a run along the directions d and e have the covariance
 
-    cov = d . e ( q_v^2 s + g^2 q_a^2 s^2 (3 t - s) / 6 ) + (1 + c n) d Sigma_0 e,      s <= t
+    cov = d . e ( q_v^2 s + g^2 q_a^2 s^2 (3 t - s) / 6 ) + d (Sigma_0 + n Sigma_1) e,      s <= t
 
 plus the variance of each reading on its own. Accelerometers make a random walk q_v of velocity, gyros a
 random walk q_a of tilt, which gravity integrates; Sigma_0 is the fraction of a pulse at the start of the run,
-and c Sigma_0 what the pulses add at each of the n turns before s. The arrests of a run are readings of one
+and Sigma_1 what the pulses add at each of the n turns before s. The arrests of a run are readings of one
 walk: rows are whitened by the Cholesky factor, as differences of successive arrests would be for q_v alone.
 
 **Unknowns** are R; the errors common to all runs; those of each run; and a step of velocity at each turn,
@@ -46,11 +46,6 @@ STEP_SIGMA: Final = 10.0
 
 ROWS_PER_POINT: Final = 5
 """With a known pivot, every n-th row during the motion also becomes an equation."""
-
-
-TURN_SHARE: Final = 12.0 * 0.008**2
-"""Variance that the pulses add at each turn, over that of the unknown fraction of a pulse at the start: what
-the motion between the pulses is off by, turned into other axes, is 0.8 % of a pulse in simulations."""
 
 
 LEAST_MOTION: Final = 3e-5
@@ -148,10 +143,10 @@ def run_equations(run: Run, noise: SensorNoise, pivot: str, design: Design) -> R
     if pivot == "fixed":
         more = _motion(run, design)
         t, d, v, A = (np.concatenate(pair) for pair in zip((t, d, v, A), more, strict=True))
-        coarse = TURN_SHARE * float(np.trace(readings.start)) + LEAST_MOTION**2
+        coarse = float(np.trace(readings.turn)) + LEAST_MOTION**2
         variance = np.concatenate([variance, np.full(len(t) - len(variance), coarse)])
     passed = np.concatenate([readings.arrest, np.zeros(len(t) - len(readings.arrest), np.int64)])
-    pulses = (1.0 + TURN_SHARE * np.minimum.outer(passed, passed)) * (d @ readings.start @ d.T)
+    pulses = d @ readings.start @ d.T + np.minimum.outer(passed, passed) * (d @ readings.turn @ d.T)
     K = walk_covariance(t, d, noise, run.gravity) + pulses + np.diag(variance)
     L = np.asarray(np.linalg.cholesky(K), np.float64)
     white = solve_triangular(L, np.column_stack([A, v]), lower=True)

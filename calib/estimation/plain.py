@@ -10,7 +10,6 @@ from calib.estimation.design import Design
 from calib.estimation.gains import Fit, gain_rows, rest_growth, run_result, singular_values_of, velocity_gains
 from calib.estimation.linear_system import (
     ROUNDING,
-    TURN_SHARE,
     NormalEquations,
     extra_terms,
     prior_parameters,
@@ -125,7 +124,7 @@ def _plain_covariance(runs: Sequence[Run], noise: SensorNoise, priors: Priors) -
         t = np.array([run.t_s[at].mean() for _, at in windows])
         K = walk_covariance(t, np.tile([1.0, 0.0, 0.0], (len(t), 1)), noise, run.gravity)
         gains = K[1::2, 1::2] - K[1::2, ::2] - K[::2, 1::2] + K[::2, ::2]
-        pulses = np.kron(np.eye(len(turns)), 2.0 * TURN_SHARE * run.readings.start[:2, :2])
+        pulses = np.kron(np.eye(len(turns)), 2.0 * run.readings.turn[:2, :2])
         blocks.append(np.kron(gains, np.eye(2)) + pulses)
     stacked = np.concatenate(rows)
     of_parameters = stacked @ np.linalg.solve(system.N[9:cut, 9:cut], stacked.T)

@@ -28,6 +28,12 @@ LEVEL: Final = 0.35
 EDGE_SHARE: Final = 0.05
 """Error at such an end, in pulses; 0.03 in simulations."""
 
+TURN_SHARE: Final = 0.008
+"""What the motion between two pulses is off by in a turn, in pulses: turned into other axes, it stays."""
+
+SHAKEN_SHARE: Final = 0.12
+"""The same, in the rms of what vibrates beyond the pulses: they come and go with it."""
+
 LEAST_VARIANCE: Final = (2e-6) ** 2
 """Smallest variance of a reading, (m/s)^2, for the effects that the model neglects."""
 
@@ -41,11 +47,18 @@ class Readings(NamedTuple):
     v: Array  # (n,), m/s
     variance: Array  # (n,), (m/s)^2, of each on its own
     start: Array  # (3, 3), covariance of the constant of a run, (m/s)^2, in n
+    turn: Array  # (3, 3), covariance of what the pulses add at each turn
 
     def take(self, at: NDArray[np.int64]) -> "Readings":
         """Return some of the readings."""
         return Readings(
-            self.t_s[at], self.arrest[at], self.direction_n[at], self.v[at], self.variance[at], self.start
+            self.t_s[at],
+            self.arrest[at],
+            self.direction_n[at],
+            self.v[at],
+            self.variance[at],
+            self.start,
+            self.turn,
         )
 
 
@@ -86,10 +99,12 @@ def read_rests(rests: Sequence[RestSamples], A: Array, pulse: Array, walk: float
             parts.append((np.full(len(read.t_s), k), np.tile(direction_n, (len(read.t_s), 1)), *read))
     arrest, direction_n, t_s, v, variance = map(np.concatenate, zip(*parts, strict=True))
     first = rests[0]
-    shaken = [vibration(first.t_s, dv) for dv in first.dv_a.T]
-    fraction = np.sqrt(np.maximum(pulse**2 / 12.0, shaken * (pulse > 0.0)))
-    edges = first.C_nb @ np.linalg.inv(A) * fraction  # column i: the start of accelerometer i, in n
-    return Readings(t_s, arrest, direction_n, v, np.maximum(variance, LEAST_VARIANCE), edges @ edges.T)
+    swing = np.array([vibration(first.t_s, dv) for dv in first.dv_a.T]) * (pulse > 0.0)
+    start = np.maximum(pulse**2 / 12.0, swing)
+    turn = (TURN_SHARE * pulse) ** 2 + SHAKEN_SHARE**2 * (start - pulse**2 / 12.0)
+    M = first.C_nb @ np.linalg.inv(A)
+    least = np.maximum(variance, LEAST_VARIANCE)
+    return Readings(t_s, arrest, direction_n, v, least, M * start @ M.T, M * turn @ M.T)
 
 
 def level_channels(up_a: Array) -> list[int]:
