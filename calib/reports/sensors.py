@@ -139,6 +139,8 @@ def _gravity(result: SensorsResult) -> Iterator[Block]:
         ("gyros", f"angle random walk {noise.angle_walk / DEG_PER_SQRT_H:.5f} deg/sqrt(h) in the rests"),
         ("accelerometers", f"velocity random walk {noise.velocity_walk / UG:.2f} ug/sqrt(Hz) in the rests"),
     ]
+    if result.evidence.is_dithered:
+        rows.append(("dither", "in the increments of the gyros; the rates of the size effect are filtered"))
     adjustment = result.adjustment
     if adjustment is not None:
         gyro, accelerometer, *_ = adjustment.wander

@@ -53,8 +53,6 @@ LARGER_WANDER: Final = 2.0
 AT_CEILING: Final = 0.999
 CHI_SQUARE_95: Final = 3.84
 """Wander at its ceiling is too large if twice as much explains the residuals significantly better."""
-NEARLY: Final = 1e-2
-"""Largest step of a parameter, in its sigma, after which the size of the wander is found, and kept."""
 CONVERGED: Final = 1e-4
 """Largest step of a parameter, in its sigma, at which the iteration ends."""
 
@@ -194,16 +192,13 @@ def adjust(
     """
     site_gravity = p.gravity if site_gravity is None else site_gravity
     attitudes = list(attitudes)
-    wander = Wander(0.0, 0.0)
+    wander, is_wander_known = Wander(0.0, 0.0), False  # found once, where the residuals are small
     Z = _whole_basis(free, len(attitudes))
     moved = np.zeros(Z.shape[1])
-    settled, largest = False, np.inf
     for iteration in range(1, MOST_ITERATIONS + 1):
         system = equations.system(p, attitudes)
         if not np.isfinite(system.residual).all():
             raise NoConvergence("the adjustment does not converge: its numbers grow without bounds")
-        if not settled and largest < NEARLY:
-            settled, wander = True, _wander(system, Z, p, site_gravity, gravity_sigma)
         solver = _Solver(system, Z, p, site_gravity, gravity_sigma, wander)
         step = solver.step(moved)
         moved = moved + step
@@ -212,8 +207,12 @@ def adjust(
         for k, psi in enumerate(whole[COLUMNS:].reshape(-1, 3)):
             attitudes[k] = Rotation.from_rotvec(psi).as_matrix() @ attitudes[k]
         largest = float(np.max(np.abs(step) / np.sqrt(np.diag(solver.covariance))))
-        if settled and largest < CONVERGED:
+        if largest > CONVERGED:
+            continue
+        if is_wander_known:
             return _result(equations, p, attitudes, free, site_gravity, gravity_sigma, wander, iteration)
+        wander = _wander(equations.system(p, attitudes), Z, p, site_gravity, gravity_sigma)
+        is_wander_known = True
     raise NoConvergence(
         f"the adjustment does not converge: after {MOST_ITERATIONS} iterations a parameter still moves by "
         f"{largest:.2g} of its sigma"
@@ -431,8 +430,9 @@ def _wander(
     damping[GRAVITY, GRAVITY] += 1.0 / gravity_sigma**2
     prior = Z.T @ damping @ Z
 
-    def deviance(ratio: Array) -> float:
-        sizes = ceilings * ratio
+    def deviance(share: Array) -> float:
+        """Twice the negative logarithm, by the variances as shares of the largest."""
+        sizes = ceilings * np.sqrt(share)
         factor = cho_factor(covariance_of(system, Wander(*sizes.tolist())), lower=True)
         weighted = cho_solve(factor, J)
         N = J.T @ weighted + prior
@@ -443,15 +443,20 @@ def _wander(
         logs = np.log(np.diag(factor[0])).sum() + np.log(np.diag(inner[0])).sum() - np.log(scale).sum()
         return float(2.0 * logs + system.residual @ cho_solve(factor, system.residual) - fitted)
 
-    begin, bounds = np.array([0.2, 0.2]), [(0.0, 1.0)] * 2
-    found = minimize(deviance, begin, bounds=bounds, method="L-BFGS-B", options={"ftol": 1e-5})
-    ratios = np.clip(found.x, 0.0, 1.0)
+    found = minimize(
+        deviance,
+        np.array([0.1, 0.1]),
+        bounds=[(0.0, 1.0)] * 2,
+        method="L-BFGS-B",
+        options={"eps": 1e-4, "ftol": 1e-10},  # the step: of differences of numbers of a thousand
+    )
+    shares = np.clip(found.x, 0.0, 1.0)
     exceeds = []
     for k in range(2):  # by a likelihood ratio: one rest more or less does not decide it
-        larger = ratios.copy()
-        larger[k] = LARGER_WANDER
-        exceeds.append(bool(ratios[k] > AT_CEILING and deviance(ratios) - deviance(larger) > CHI_SQUARE_95))
-    return Wander(*(ceilings * ratios).tolist(), *exceeds)
+        larger = shares.copy()
+        larger[k] = LARGER_WANDER**2
+        exceeds.append(bool(shares[k] > AT_CEILING and deviance(shares) - deviance(larger) > CHI_SQUARE_95))
+    return Wander(*(ceilings * np.sqrt(shares)).tolist(), *exceeds)
 
 
 def _result(
@@ -469,7 +474,8 @@ def _result(
     solver = _Solver(system, Z, p, site_gravity, gravity_sigma, wander)
     whole = Z @ solver.covariance @ Z.T
     fitted = solver.J @ solver.covariance @ solver.J.T
-    variance = np.maximum(np.diag(solver.V) - np.diag(fitted), 1e-12 * np.diag(solver.V))
+    # below a hundredth of redundancy a residual tells nothing
+    variance = np.maximum(np.diag(solver.V) - np.diag(fitted), 0.01 * np.diag(solver.V))
     factor = cho_factor(solver.V, lower=True)
     chi_square = float(system.residual @ cho_solve(factor, system.residual))
     information = np.trace(solver.covariance @ (solver.J.T @ cho_solve(factor, solver.J)))

@@ -212,7 +212,11 @@ class Equations:
         degc = 0.5 * (before.degc + after.degc)
         own = at_temperature(p, degc, self.reference_degc)
         motion = integrate(
-            link.samples, own, (readings[a][0], readings[z][0]), (readings[a][1], readings[z][1])
+            link.samples,
+            own,
+            (readings[a][0], readings[z][0]),
+            (readings[a][1], readings[z][1]),
+            self.evidence.rate_filter,
         )
         C, C_after, f, omega = attitudes[a], attitudes[z], p.f_n, p.omega_ie_n
         T = motion.duration_s

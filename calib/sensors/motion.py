@@ -20,6 +20,7 @@ import numpy as np
 
 from calib.sensors.parameters import BASE, Parameters
 from imudrv.arrays import Array
+from imudrv.imu.rate_filter import RateFilter
 from imudrv.kernels import kernel
 from imudrv.nav.attitude import product, put_quaternion, quaternion_of_vector, rows_of, unit
 from imudrv.records import Records
@@ -60,9 +61,9 @@ CONSTANTS: Final = np.dtype(
         ("C_ba", np.float64, (3, 3)),
         ("r_b", np.float64, (3, 3)),
         ("skew_s", np.float64),
-        ("omega_before", np.float64, 3),  # rates and forces of the rests before and after
-        ("omega_after", np.float64, 3),
-        ("force_before", np.float64, 3),  # body axes
+        ("mean_of_ends", np.bool_),  # gives the rate in the middle: the angle has dither in it
+        ("omega_before", np.float64, 3),  # rate and forces of the rests before and after, body axes
+        ("force_before", np.float64, 3),
         ("force_after", np.float64, 3),
     ],
     align=True,
@@ -83,6 +84,10 @@ RESULT: Final = np.dtype(
 )
 
 
+STEADY: Final = RateFilter("centred", np.array([-1.0, 7.0, 7.0, -1.0]) / 12.0, 2)
+"""Rate at the end of a sample, exact for one cubic in time."""
+
+
 class Motion(NamedTuple):
     """A motion from rest to rest, integrated."""
 
@@ -96,7 +101,11 @@ class Motion(NamedTuple):
 
 
 def integrate(
-    samples: Records, p: Parameters, rates: tuple[Array, Array], forces: tuple[Array, Array]
+    samples: Records,
+    p: Parameters,
+    rates: tuple[Array, Array],
+    forces: tuple[Array, Array],
+    rate_filter: RateFilter = STEADY,
 ) -> Motion:
     """Integrate a motion.
 
@@ -108,6 +117,8 @@ def integrate(
         Those at the temperature of the motion.
     rates, forces : tuple of two ndarray, shape (3,)
         Rate, rad/s, and specific force, m/s^2, of the rests before and after, body axes.
+    rate_filter : RateFilter
+        For the rate of the size effect.
 
     Returns
     -------
@@ -118,9 +129,9 @@ def integrate(
     c["W"], c["beta"], c["M"], c["b"], c["q"] = p.W, p.beta, p.M, p.b, p.q
     c["is_asymmetry"] = p.nonlinearity == "asymmetry"
     c["A"], c["C_ba"], c["r_b"], c["skew_s"] = p.A, np.linalg.inv(p.A), p.r_b, p.skew_s
-    c["omega_before"], c["omega_after"] = rates
+    c["omega_before"], c["mean_of_ends"] = rates[0], rate_filter.middle_from_ends
     c["force_before"], c["force_after"] = forces
-    _integrate(samples, constants, out)
+    _integrate(samples, _end_rates(samples, p, rates, rate_filter), constants, out)
     result = out[0]
     return Motion(
         float(result["T"]),
@@ -133,8 +144,19 @@ def integrate(
     )
 
 
+def _end_rates(samples: Records, p: Parameters, rates: tuple[Array, Array], rate_filter: RateFilter) -> Array:
+    """Return the rate at the beginning of a motion and at the end of each sample, rad/s, body axes."""
+    omega = samples["gyro"] @ p.W.T / samples["T"][:, None] - p.beta
+    taps, lag = rate_filter.taps, rate_filter.lag
+    padded = np.concatenate([np.tile(rates[0], (len(taps) - lag, 1)), omega, np.tile(rates[1], (lag, 1))])
+    n = len(omega) + 1
+    ends: Array = sum((tap * padded[j : j + n] for j, tap in enumerate(taps.tolist())), np.zeros((n, 3)))
+    ends[0], ends[-1] = rates  # a mean is better known than single samples
+    return ends
+
+
 @kernel
-def _integrate(samples: Records, constants: Records, out: Records) -> None:
+def _integrate(samples: Records, ends: Array, constants: Records, out: Records) -> None:
     """Fill in the one row of `out`."""
     c, o = constants[0], out[0]
     M, C_ba, A = matrix(c["M"]), matrix(c["C_ba"]), matrix(c["A"])
@@ -150,8 +172,9 @@ def _integrate(samples: Records, constants: Records, out: Records) -> None:
         dtheta = _angle(sample, c)
         e, curve = _input(sample, c)
         measured = rotate(M, subtract(e, times(vector_at(c["q"], 0), curve)))
-        w1 = _end_rate(samples, k, c)
-        effect = _effect(w0, scale(1.0 / T, dtheta), w1, T)
+        w1 = row(ends, k + 1)
+        middle_rate = scale(0.5, add(w0, w1)) if c["mean_of_ends"] else scale(1.0 / T, dtheta)
+        effect = _effect(w0, middle_rate, w1, T)
         s_x, s_y, s_z = _along(A[0], effect), _along(A[1], effect), _along(A[2], effect)
         dv = subtract(measured, rotate(C_ba, (dot(s_x, r_x), dot(s_y, r_y), dot(s_z, r_z))))
 
@@ -202,23 +225,6 @@ def _input(sample: np.void, c: np.void) -> tuple[Vector, Vector]:
     if c["is_asymmetry"]:
         return e, (0.5 * abs(e[0]), 0.5 * abs(e[1]), 0.5 * abs(e[2]))
     return e, scale(1.0 / T, times(e, e))
-
-
-@kernel
-def _end_rate(samples: Records, k: int, c: np.void) -> Vector:
-    """Return the rate at the end of sample k: exact for a cubic one where two neighbours are known."""
-    if k == len(samples) - 1:
-        return vector_at(c["omega_after"], 0)
-    inner = add(_rate(samples[k], c), _rate(samples[k + 1], c))
-    if k == 0 or k == len(samples) - 2:
-        return scale(0.5, inner)
-    outer = add(_rate(samples[k - 1], c), _rate(samples[k + 2], c))
-    return scale(1.0 / 12.0, subtract(scale(7.0, inner), outer))
-
-
-@kernel
-def _rate(sample: np.void, c: np.void) -> Vector:
-    return scale(1.0 / sample["T"], _angle(sample, c))
 
 
 @kernel

@@ -15,12 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.detection.segments import Segmenter
-from calib.sensors.motion import SAMPLE
+from calib.sensors.motion import SAMPLE, STEADY
 from calib.sensors.parameters import NominalScales
 from imudrv.arrays import Array
 from imudrv.errors import InputError
 from imudrv.imu.coefficients import Coefficients
 from imudrv.imu.compensation import Compensator
+from imudrv.imu.rate_filter import RateFilter, rate_filter
 from imudrv.records import Flag, Records
 from imudrv.units import ARCSEC, NS, STANDARD_GRAVITY, UG
 from imudrv.wire.layout import Layout
@@ -77,6 +78,8 @@ class RestBins:
         Mean temperature of the gyros and of each accelerometer; NaN: not measured.
     span_k : float
         Largest change of any of these from bin to bin of the rest.
+    shaking : float
+        Largest scatter of single angle increments of a gyro, rad, rms.
     """
 
     session: int
@@ -89,6 +92,7 @@ class RestBins:
     means: Array
     degc: Array
     span_k: float = 0.0
+    shaking: float = 0.0
 
     @property
     def duration_s(self) -> float:
@@ -190,6 +194,8 @@ class Evidence:
         Pulse of a gyro, rad, and of an accelerometer, m/s.
     fastest : float
         Largest rate of any gyro in a motion, rad/s.
+    rate_filter : RateFilter
+        For the rate of the size effect: without the dither that the increments of the gyros carry.
     """
 
     rests: tuple[RestBins, ...]
@@ -198,6 +204,12 @@ class Evidence:
     noise: Noise
     quanta: tuple[float, float]
     fastest: float = 0.0
+    rate_filter: RateFilter = STEADY
+
+    @property
+    def is_dithered(self) -> bool:
+        """Whether the increments of the gyros carry dither, which a filter takes off the rates."""
+        return self.rate_filter is not STEADY
 
 
 def read_evidence(
@@ -266,7 +278,8 @@ def read_evidence(
             else:
                 left.append(item)
     ordered = tuple(sorted(left, key=lambda one: (one.session, one.start_s)))
-    return Evidence(tuple(still), tuple(links), ordered, noise, quanta, fastest)
+    rates = _rate_filter(still, noise, quanta[0], layout)
+    return Evidence(tuple(still), tuple(links), ordered, noise, quanta, fastest, rates)
 
 
 KNOCK_S: Final = 10.0
@@ -286,6 +299,21 @@ def _division(link: Link, rests: Sequence[RestBins]) -> Iterator[Left]:
     else:
         reason = f"a knock of {moved_s:.1f} s at {before.stop_s + GUARD_S:.1f} s: divided into two rests"
     yield Left(before.session, before.start_s, after.stop_s, "rest", reason)
+
+
+DITHER: Final = 0.5 * ARCSEC
+"""Scatter of an angle increment beside pulses and noise that counts as dither, rms."""
+
+
+def _rate_filter(rests: Sequence[RestBins], noise: Noise, quantum: float, layout: Layout) -> RateFilter:
+    """Return the filter of the rate: for dither, where the increments carry any and it can be."""
+    usual = 0.5 * quantum + noise.angle_walk * sqrt(samples_s(layout))
+    if float(np.median([rest.shaking for rest in rests])) < usual + DITHER:
+        return STEADY
+    try:
+        return rate_filter("dither", layout.interval_ns)
+    except InputError:  # it is aliased into the motion; the residuals tell
+        return STEADY
 
 
 LEAST_RESTS: Final = 3
@@ -351,6 +379,7 @@ class _Binner:
         self._samples = samples
         self._weights = (samples - np.arange(samples)) / samples
         self.runs: list[tuple[int, list[Array], list[Array], list[Array]]] = []
+        self._squares: list[Array] = []  # variance of the gyros' increments, bin by bin
         self.bad = 0
         self.gaps = 0
         self._rest: Array = np.zeros((0, 10))
@@ -374,6 +403,12 @@ class _Binner:
             sums.append(bins[:, :, :6].sum(axis=1))
             means.append(np.tensordot(bins[:, :, :6], self._weights, (1, 0)))
             degc.append(bins[:, :, 6:].mean(axis=1))
+            self._squares.append(bins[:, :, :3].var(axis=1))
+
+    @property
+    def shaking(self) -> float:
+        """Largest scatter of the increments of a gyro, rms."""
+        return float(np.sqrt(np.concatenate(self._squares).mean(axis=0)).max()) if self._squares else 0.0
 
 
 def _bins(
@@ -439,6 +474,7 @@ def _bins(
                 np.concatenate(means),
                 temperatures.mean(axis=0),
                 span,
+                binner.shaking,
             )
         )
     return rests, left

@@ -619,8 +619,9 @@ def test_the_plan_predicts_the_uncertainty_that_is_stated_then(result):
             if one.path in stated
         ]
     )
-    # the scales are nominal there; wander, and how the hand moves, differ
-    assert 0.6 < ratios.min() < ratios.max() < 1.6
+    # the plan knows neither the wander that is found then, 0.9 ug here, nor how the hand will move
+    assert 0.4 < ratios.min() < ratios.max() < 1.6
+    assert 0.75 < np.median(ratios) < 1.25
 
 
 @pytest.mark.parametrize(
