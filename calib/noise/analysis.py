@@ -273,6 +273,13 @@ def _result(
         )
         raise InputError(where)
     fitted = usable(allan)
+    if constant := [
+        name for name, least in zip(CHANNELS, fitted.variance.min(axis=0), strict=True) if not least
+    ]:
+        raise InputError(
+            f"{', '.join(constant)}: expected increments with noise, got the same ones again and again; the "
+            "sensor is dead, or the data are no pulses of a unit at rest"
+        )
     estimates = EstimatesCovariance(fitted, interval_s)
     channels = tuple(
         ChannelNoise(

@@ -59,8 +59,8 @@ def run(arguments: argparse.Namespace) -> int:
 def _full(folder: Path) -> int:
     """Calibrate a new unit, one command after the other, each shown as a user would type it."""
     print(f"{FULL_STORY}\nAll files are in {folder}, and commands run there.", flush=True)
-    _write_scenarios(folder)
-    for program, *command in _commands():
+    write_scenarios(folder)
+    for program, *command in commands():
         print(f"\n$ {program} {shlex.join(command)}", flush=True)
         code = subprocess.run([sys.executable, "-m", program, *command], cwd=folder, check=False).returncode
         if code != OK:
@@ -69,7 +69,7 @@ def _full(folder: Path) -> int:
     return OK
 
 
-def _write_scenarios(folder: Path) -> None:
+def write_scenarios(folder: Path) -> None:
     """Write the scenarios of one unit: by hand on six faces, an hour at rest, and three rotations."""
     faces = scenarios.load("six-faces-turned")
     rest = {"seed": faces.seed + 1, "motion": (Segment(rest=Rest(duration_s=REST_S)),)}
@@ -81,7 +81,7 @@ def _write_scenarios(folder: Path) -> None:
         settings_file.write(folder / f"{name}.yaml", turned)
 
 
-def _commands() -> Iterator[list[str]]:
+def commands() -> Iterator[list[str]]:
     """Yield program and arguments of each step."""
     for name in ("faces", "rest", *POSES):
         truth = ["--truth", "truth.yaml"] if name == "faces" else []

@@ -345,6 +345,14 @@ def test_bad_arguments_are_named(
     assert message in capsys.readouterr().err
 
 
+def test_a_dead_sensor_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    samples = pulses(30.0)
+    samples["gyro"][:, 1] = 0
+    write(tmp_path / "dead.raw", samples)
+    assert noise(tmp_path / "dead.raw", "--profile", "imu50-rs422") == 2
+    assert "gyro Y: expected increments with noise, got the same ones" in capsys.readouterr().err
+
+
 def test_the_same_capture_twice_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert noise(folder / "rest.raw", folder / "rest.raw") == 2
     assert "expected another capture" in capsys.readouterr().err
