@@ -16,6 +16,10 @@ COMMANDS: Final = {
     ),
     "key": "Make or show the key with which this bench signs its sessions and certificates.",
     "fleet": "Index many sessions, and find units that drift and benches that are off.",
+    "reidentify": (
+        "Identify the sessions of a tree again and compare with what was certified; "
+        "exit code 3 if one differs."
+    ),
     "identify": "Identify lever arms from captures of rotations: certificate and report.",
     "align": "Align a rest: level, heading, and its readings against the site; exit code 3 if it moved.",
     "validate": "Navigate the same pulses with and without compensation; exit code 3 if a verdict is bad.",
