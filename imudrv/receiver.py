@@ -25,6 +25,7 @@ from imudrv.posix import require_posix
 from imudrv.profiles.schema import SerialLine
 from imudrv.records import FRAME, Records
 from imudrv.sinks.serial import BAUDRATE
+from imudrv.streams import Subscription
 from imudrv.url import Url, device_path, host_and_port, serial_settings, split
 from imudrv.wire.datagram import DatagramDecoder
 from imudrv.wire.layout import Layout, Sequence, SequenceKind
@@ -68,10 +69,12 @@ class Receiver(AbstractContextManager["Receiver"]):
         self._decoder = DatagramDecoder()
         self._tracker = SequenceTracker(_COUNTED)
         self._ordered(b"")  # compiles the kernels before samples arrive
-        parts = split(url, ("udp", "tcp", "serial"))
+        parts = split(url, ("udp", "tcp", "serial", "zenoh"))
         self._is_packets = parts.scheme == "udp"
         self._device = _open(parts)
-        self._receive = receiver_of(self._device)
+        self._receive = (
+            self._device.recv if isinstance(self._device, Subscription) else receiver_of(self._device)
+        )
         self._is_open = True
 
     @property
@@ -130,7 +133,8 @@ def receive(url: str, timeout_s: float | None = None) -> Receiver:
     ----------
     url : str
         ``udp://[HOST]:PORT`` listens, on the loopback unless another HOST of this machine is given;
-        ``tcp://HOST:PORT`` connects; ``serial:///dev/ttyUSB0?baudrate=921600`` opens a line.
+        ``tcp://HOST:PORT`` connects; ``serial:///dev/ttyUSB0?baudrate=921600`` opens a line;
+        ``zenoh://imu50/BENCH/UNIT?config=FILE`` subscribes to a unit.
     timeout_s : float, optional
         Longest wait for samples, s, after which the iteration ends; by default there is no limit.
 
@@ -149,7 +153,9 @@ def receive(url: str, timeout_s: float | None = None) -> Receiver:
     return Receiver(url, timeout_s)
 
 
-def _open(url: Url) -> socket.socket | serial.Serial:
+def _open(url: Url) -> socket.socket | serial.Serial | Subscription:
+    if url.scheme == "zenoh":
+        return Subscription(url)
     if url.scheme == "serial":
         return _open_line(url)
     host, port = host_and_port(url, LOOPBACK)

@@ -21,6 +21,10 @@ COMMANDS: Final = {
         "code 3 if the verdict is bad."
     ),
     "fleet": "Index many sessions, and find units that drift and benches that are off.",
+    "reidentify": (
+        "Identify the sessions of a tree again and compare with what was certified; "
+        "exit code 3 if one differs."
+    ),
     "identify": "Identify lever arms from captures of rotations: certificate and report.",
     "noise": (
         "Compute the noise of a unit from a long rest: Allan deviations and their coefficients; "

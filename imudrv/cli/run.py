@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_profile(parser)
     add("--calibration", metavar="C.yaml", help="calibration file of the unit")
     add("--unit", metavar="SERIAL", help="serial number of the connected unit")
-    text = "udp://HOST:PORT, tcp://[HOST]:PORT, serial://PATH, can://..., file:NAME; may be repeated"
+    text = "udp://HOST:PORT, tcp://[HOST]:PORT, serial://PATH, can://..., zenoh://KEY, file:NAME; repeatable"
     add("--out", dest="outputs", action="append", metavar="URL", help=text)
     add("--record", metavar="FILE.mcap", help="record everything; in a folder: one file for each run")
     text = "have the disk keep the recording at least this often (default: when the system does, 5 to 30 s)"
