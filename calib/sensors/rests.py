@@ -5,7 +5,7 @@ the edge of a rest is the mean over a bin of (count - rate t), which the pulse h
 counts begin and end the motions, so that their errors are shared.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence, Set
 from dataclasses import dataclass, field
 from itertools import pairwise
 from math import pi, sqrt
@@ -242,8 +242,11 @@ def read_evidence(
     )
     found: list[RestBins] = []
     left: list[Left] = []
+    cuts: set[tuple[int, int]] = set()  # where a long rest was divided
     for session, pulses in enumerate(captures):
         windows, short = _windows(session, pulses(), layout, nominal)
+        guards = 2 * round(GUARD_S / samples_s(layout))
+        cuts |= {(session, b.start) for a, b in pairwise(windows) if b.start - a.stop == guards}
         left += short
         rests, dropped = _bins(session, pulses(), windows, layout, nominal)
         found += rests
@@ -273,7 +276,7 @@ def read_evidence(
         for item in _links(pulses(), [(k, still[k]) for k in numbers], layout, nominal):
             if isinstance(item, Link):
                 links.append(item)
-                left += _division(item, still)
+                left += _division(item, still, cuts)
                 fastest = max(fastest, float(np.abs(item.samples["gyro"] / item.samples["T"][:, None]).max()))
             else:
                 left.append(item)
@@ -287,17 +290,15 @@ KNOCK_RAD: Final = 0.02
 """Longest motion, and largest turn of it, that is a knock within one rest."""
 
 
-def _division(link: Link, rests: Sequence[RestBins]) -> Iterator[Left]:
+def _division(link: Link, rests: Sequence[RestBins], cuts: Set[tuple[int, int]]) -> Iterator[Left]:
     """Yield that one rest was divided into two, if it was."""
     before, after = rests[link.before], rests[link.after]
     turned = np.abs(link.samples["gyro"].sum(axis=0)).max()
     if link.duration_s > KNOCK_S or turned > KNOCK_RAD:
         return
-    moved_s = link.duration_s - 2.0 * GUARD_S
-    if moved_s < 0.1 * GUARD_S:
+    reason = f"a knock at {0.5 * (before.stop_s + after.start_s):.1f} s divides it into two rests"
+    if (after.session, after.start) in cuts:
         reason = "it is long: divided into two rests"
-    else:
-        reason = f"a knock of {moved_s:.1f} s at {before.stop_s + GUARD_S:.1f} s: divided into two rests"
     yield Left(before.session, before.start_s, after.stop_s, "rest", reason)
 
 
