@@ -113,7 +113,9 @@ def _rests(result: SensorsResult) -> Iterator[Block]:
             )
         )
     if adjustment is not None:
-        yield Figure("Residuals of rests and motions, in sigma", partial(figures.residuals, result))
+        yield Figure(
+            "Residuals, in sigma; dots: gyros, crosses: accelerometers", partial(figures.residuals, result)
+        )
         yield Figure(
             "Direction of up in body axes at each rest, in order", partial(figures.attitudes, result)
         )

@@ -29,7 +29,7 @@ def residuals(result: SensorsResult) -> bytes:
                         color=COLOURS[2],
                         markersize=3,
                     )
-        axes[0].set_ylabel("sigma; dots: gyros, crosses: accelerometers")
+        axes[0].set_ylabel("residual, sigma")
     return svg.getvalue()
 
 
@@ -44,7 +44,8 @@ def attitudes(result: SensorsResult) -> bytes:
             axes.plot(azimuth, height, "-", color="#cccccc", linewidth=0.5)
             axes.plot(azimuth, height, "o", color=COLOURS[0], markersize=4)
             for k, place in enumerate(zip(azimuth, height, strict=True)):
-                axes.annotate(str(k + 1), place, (3, 3), textcoords="offset points", fontsize=6)
+                at = (3, -9) if k % 2 else (3, 3)  # a turn in place leaves up where it was
+                axes.annotate(str(k + 1), place, at, textcoords="offset points", fontsize=6)
         axes.set(
             xlim=(-190, 190),
             ylim=(-95, 95),

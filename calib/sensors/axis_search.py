@@ -14,9 +14,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from calib.sensors.equations import curved
+from calib.sensors.evidence import Evidence
 from calib.sensors.motion import integrate
 from calib.sensors.parameters import Parameters
-from calib.sensors.rests import Evidence
 from imudrv.arrays import Array
 from imudrv.nav.earth import EARTH_RATE
 from imudrv.units import DEG_PER_H

@@ -24,6 +24,7 @@ from calib.sensors.adjustment import (
 )
 from calib.sensors.axis_search import find_exchange, measured_latitude, scale_faults, wrong_hemisphere
 from calib.sensors.equations import Equations, start_attitudes
+from calib.sensors.evidence import Evidence
 from calib.sensors.faces import find_faces
 from calib.sensors.parameters import (
     EARTH,
@@ -33,7 +34,7 @@ from calib.sensors.parameters import (
     start_parameters,
 )
 from calib.sensors.prediction import additions
-from calib.sensors.rests import GUARD_S, Evidence, read_evidence
+from calib.sensors.rests import GUARD_S, read_evidence
 from calib.sensors.result import CaptureInput, Judgement, SensorsInput, SensorsResult, pose_of
 from calib.sensors.verdict import (
     REDUCED_BAD,

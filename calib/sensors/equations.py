@@ -18,6 +18,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from calib.sensors.evidence import Evidence, Link, Noise, RestBins, edge_variance
 from calib.sensors.motion import integrate
 from calib.sensors.parameters import (
     ACCELEROMETER_SCALE_T,
@@ -35,7 +36,6 @@ from calib.sensors.parameters import (
     Q,
     W,
 )
-from calib.sensors.rests import Evidence, Link, Noise, RestBins, edge_variance
 from imudrv.arrays import Array
 from imudrv.units import DEG_PER_H, UG
 

@@ -17,10 +17,11 @@ from scipy.spatial.transform import Rotation
 from calib.axes import Side, vector
 from calib.sensors.adjustment import MEASURED_GRAVITY, NORMAL_GRAVITY, Free, information, posterior
 from calib.sensors.equations import Equations
+from calib.sensors.evidence import Evidence, Link, Noise, RestBins
 from calib.sensors.motion import SAMPLE
 from calib.sensors.observability import RATIO
 from calib.sensors.parameters import NominalScales, Number, Parameters, start_parameters
-from calib.sensors.rests import GUARD_S, Evidence, Link, Noise, RestBins
+from calib.sensors.rests import GUARD_S
 from calib.sensors.result import free_numbers
 from imudrv.arrays import Array
 from imudrv.nav.earth import earth_rate_n

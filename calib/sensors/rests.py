@@ -1,20 +1,19 @@
 """Rests of a capture and the samples of the motions between them.
 
-Three passes over the pulses: where the unit rests; the rests, in bins of a second; the motions. A count at
-the edge of a rest is the mean over a bin of (count - rate t), which the pulse hardly shows in. The same
-counts begin and end the motions, so that their errors are shared.
+Three passes over the pulses: where the unit rests; the rests, in bins of a second; the motions.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Sequence, Set
+from dataclasses import dataclass
 from itertools import pairwise
-from math import pi, sqrt
+from math import sqrt
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib.detection.segments import Segmenter
+from calib.sensors.evidence import Evidence, Left, Link, Noise, RestBins, rest_noise
 from calib.sensors.motion import SAMPLE, STEADY
 from calib.sensors.parameters import NominalScales
 from imudrv.arrays import Array
@@ -40,176 +39,6 @@ DRIFT_FLOOR: Final = 1.5 * UG
 
 BAD_FLAGS: Final = int(Flag.SATURATED | Flag.FAULT)
 GAP_FLAGS: Final = int(Flag.MISSING_BEFORE | Flag.LONG_INTERVAL)
-
-
-@dataclass(frozen=True)
-class Noise:
-    """Random walks of a unit's gyros and accelerometers, each axis: rad/sqrt(s), m/s/sqrt(s)."""
-
-    angle_walk: float
-    velocity_walk: float
-
-
-LEAST_NOISE: Final = Noise(1e-7, 1e-5)
-"""Least noise that is believed, 0.0003 deg/sqrt(h) and 1 ug/sqrt(Hz); the integration errs by less."""
-
-
-@dataclass(frozen=True)
-class RestBins:
-    """A rest: sums of its increments at nominal scale over bins of a second.
-
-    Attributes
-    ----------
-    session : int
-        Number of the capture.
-    start, stop : int
-        Counter of the first sample, and of the first after the last.
-    start_s : float
-        Time from the beginning of the capture.
-    bin_s : float
-        Length of a bin.
-    samples : int
-        Samples of a bin.
-    sums : ndarray, shape (n, 6)
-        Increments of gyros and accelerometers X Y Z over each bin, rad, m/s.
-    means : ndarray, shape (n, 6)
-        Mean over each bin of the sum since its beginning.
-    degc : ndarray, shape (4,)
-        Mean temperature of the gyros and of each accelerometer; NaN: not measured.
-    span_k : float
-        Largest change of any of these from bin to bin of the rest.
-    shaking : float
-        Largest scatter of single angle increments of a gyro, rad, rms.
-    """
-
-    session: int
-    start: int
-    stop: int
-    start_s: float
-    bin_s: float
-    samples: int
-    sums: Array
-    means: Array
-    degc: Array
-    span_k: float = 0.0
-    shaking: float = 0.0
-
-    @property
-    def duration_s(self) -> float:
-        """Length, s."""
-        return len(self.sums) * self.bin_s
-
-    @property
-    def stop_s(self) -> float:
-        """Time of the end from the beginning of the capture."""
-        return self.start_s + self.duration_s
-
-    @property
-    def rate(self) -> Array:
-        """Mean rates and forces at nominal scale, shape (6,), rad/s and m/s^2."""
-        return _rate(self.sums, self.means, self.bin_s)
-
-    @property
-    def edges(self) -> Array:
-        """Smoothed less actual sum at the begin and at the end of the rest, shape (2, 6)."""
-        early, late = 0.5 * (self.samples + 1), 0.5 * (self.samples - 1)
-        step = self.rate * self.bin_s / self.samples
-        before = self.means[0] - early * step
-        after = self.means[-1] - self.sums[-1] + late * step
-        return np.stack([before, after])
-
-    def drift(self, noise: Noise, quantum: float) -> tuple[float, float]:
-        """Return the change of the force from the first to the last quarter, m/s^2, and its sigma."""
-        n = max(2, len(self.sums) // 4)
-        change = _rate(self.sums[-n:], self.means[-n:], self.bin_s) - _rate(
-            self.sums[:n], self.means[:n], self.bin_s
-        )
-        seconds = (n - 1) * self.bin_s
-        variance = noise.velocity_walk**2 / seconds + 2.0 * (0.3 * quantum / seconds) ** 2
-        return float(np.linalg.norm(change[3:])), sqrt(2.0 * variance)
-
-
-def _rate(sums: Array, means: Array, bin_s: float) -> Array:
-    """Return the rate between the mean counts of the first and the last bin."""
-    late = sums[:-1].sum(axis=0) + means[-1]
-    rate: Array = (late - means[0]) / ((len(sums) - 1) * bin_s)
-    return rate
-
-
-@dataclass(frozen=True)
-class Left:
-    """A rest or a motion that is not used as one.
-
-    Attributes
-    ----------
-    start_s, stop_s : float
-        Time from the beginning of the capture.
-    what : str
-        'rest' or 'motion'.
-    reason : str
-        Why, in words.
-    """
-
-    session: int
-    start_s: float
-    stop_s: float
-    what: str
-    reason: str
-
-
-@dataclass(frozen=True)
-class Link:
-    """The samples between two rests that follow each other in one capture.
-
-    Attributes
-    ----------
-    before, after : int
-        Numbers of the rests.
-    samples : ndarray of SAMPLE
-        With the counts of the edges in them.
-    """
-
-    before: int
-    after: int
-    samples: Records = field(repr=False)
-
-    @property
-    def duration_s(self) -> float:
-        """Length, s."""
-        return float(self.samples["T"].sum())
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """Everything that captures say: rests, motions, and what was left out.
-
-    Attributes
-    ----------
-    rests : tuple of RestBins
-        In order, capture by capture.
-    links : tuple of Link
-    left : tuple of Left
-    noise : Noise
-    quanta : tuple of float
-        Pulse of a gyro, rad, and of an accelerometer, m/s.
-    fastest : float
-        Largest rate of any gyro in a motion, rad/s.
-    rate_filter : RateFilter
-        For the rate of the size effect: without the dither that the increments of the gyros carry.
-    """
-
-    rests: tuple[RestBins, ...]
-    links: tuple[Link, ...]
-    left: tuple[Left, ...]
-    noise: Noise
-    quanta: tuple[float, float]
-    fastest: float = 0.0
-    rate_filter: RateFilter = STEADY
-
-    @property
-    def is_dithered(self) -> bool:
-        """Whether the increments of the gyros carry dither, which a filter takes off the rates."""
-        return self.rate_filter is not STEADY
 
 
 def read_evidence(
@@ -242,8 +71,11 @@ def read_evidence(
     )
     found: list[RestBins] = []
     left: list[Left] = []
+    cuts: set[tuple[int, int]] = set()  # where a long rest was divided
     for session, pulses in enumerate(captures):
         windows, short = _windows(session, pulses(), layout, nominal)
+        guards = 2 * round(GUARD_S / samples_s(layout))
+        cuts |= {(session, b.start) for a, b in pairwise(windows) if b.start - a.stop == guards}
         left += short
         rests, dropped = _bins(session, pulses(), windows, layout, nominal)
         found += rests
@@ -273,7 +105,7 @@ def read_evidence(
         for item in _links(pulses(), [(k, still[k]) for k in numbers], layout, nominal):
             if isinstance(item, Link):
                 links.append(item)
-                left += _division(item, still)
+                left += _division(item, still, cuts)
                 fastest = max(fastest, float(np.abs(item.samples["gyro"] / item.samples["T"][:, None]).max()))
             else:
                 left.append(item)
@@ -287,17 +119,15 @@ KNOCK_RAD: Final = 0.02
 """Longest motion, and largest turn of it, that is a knock within one rest."""
 
 
-def _division(link: Link, rests: Sequence[RestBins]) -> Iterator[Left]:
+def _division(link: Link, rests: Sequence[RestBins], cuts: Set[tuple[int, int]]) -> Iterator[Left]:
     """Yield that one rest was divided into two, if it was."""
     before, after = rests[link.before], rests[link.after]
     turned = np.abs(link.samples["gyro"].sum(axis=0)).max()
     if link.duration_s > KNOCK_S or turned > KNOCK_RAD:
         return
-    moved_s = link.duration_s - 2.0 * GUARD_S
-    if moved_s < 0.1 * GUARD_S:
+    reason = f"a knock at {0.5 * (before.stop_s + after.start_s):.1f} s divides it into two rests"
+    if (after.session, after.start) in cuts:
         reason = "it is long: divided into two rests"
-    else:
-        reason = f"a knock of {moved_s:.1f} s at {before.stop_s + GUARD_S:.1f} s: divided into two rests"
     yield Left(before.session, before.start_s, after.stop_s, "rest", reason)
 
 
@@ -578,46 +408,3 @@ class _Span:
             samples["gyro"][at] += change[:3]
             samples["accelerometer"][at] += change[3:]
         return Link(*self._numbers, samples)
-
-
-def rest_noise(rests: Sequence[RestBins]) -> Noise:
-    """Return the random walks, from the second differences of the mean counts of the bins.
-
-    With white noise s of a mean count and a random walk q the variance of a second difference over m bins is
-    `6 s^2 + q^2 (2 m - 1) T` for m >= 1 bins of length T: the difference of two lags is the walk's alone.
-    """
-    walks = []
-    for axes in (slice(0, 3), slice(3, 6)):
-        squares, counts = np.zeros(len(_LAGS)), np.zeros(len(_LAGS))
-        bin_s = rests[0].bin_s
-        for rest in rests:
-            counts_at = np.concatenate([np.zeros((1, 3)), np.cumsum(rest.sums[:-1, axes], axis=0)])
-            mean = counts_at + rest.means[:, axes]
-            for k, m in enumerate(_LAGS):
-                if len(mean) > 2 * m:
-                    second = mean[2 * m :] - 2.0 * mean[m:-m] + mean[: -2 * m]
-                    squares[k] += float((second**2).sum())
-                    counts[k] += second.size
-        usable = counts > 0
-        variance = squares[usable] / counts[usable]
-        lags = np.array(_LAGS)[usable]
-        if len(lags) < 2:
-            walks.append(0.0)
-            continue
-        walk = (variance[-1] - variance[0]) / (2.0 * (lags[-1] - lags[0]) * bin_s)
-        walks.append(sqrt(max(float(walk), 0.0)))
-    return Noise(max(walks[0], LEAST_NOISE.angle_walk), max(walks[1], LEAST_NOISE.velocity_walk))
-
-
-_LAGS: Final = (1, 6)
-
-
-def edge_variance(pulses_per_bin: Array) -> Array:
-    """Return the variance of a mean count over a bin, in pulses squared, by the pulses that come in it.
-
-    The count is a sawtooth about (rate t); its mean over n periods has the variance
-    `sum of (1 / (pi k))^2 / 2 sinc^2(k n)`, here with the mean of sin^2 for a rate that is not known so well.
-    """
-    k = np.arange(1, 51)
-    passed = 1.0 / (1.0 + 2.0 * (pi * np.multiply.outer(np.abs(pulses_per_bin), k)) ** 2)
-    return np.asarray((passed * 0.5 / (pi * k) ** 2).sum(axis=-1), np.float64)

@@ -11,6 +11,7 @@ import numpy as np
 from calib.axes import axis_name
 from calib.sensors import observability
 from calib.sensors.adjustment import Adjustment, Free
+from calib.sensors.evidence import Evidence
 from calib.sensors.faces import Faces
 from calib.sensors.parameters import (
     BETA,
@@ -25,7 +26,6 @@ from calib.sensors.parameters import (
     numbers,
     numbers_jacobian,
 )
-from calib.sensors.rests import Evidence
 from imudrv.arrays import Array
 from imudrv.calibration import Calibration
 from imudrv.site import Site

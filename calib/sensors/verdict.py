@@ -9,7 +9,7 @@ import numpy as np
 from calib.sensors import observability
 from calib.sensors.adjustment import Adjustment
 from calib.sensors.equations import ACCELEROMETER_WANDER_CEILING, GYRO_WANDER_CEILING
-from calib.sensors.rests import Evidence
+from calib.sensors.evidence import Evidence
 from calib.sensors.result import Estimate, Judgement
 from imudrv.nav.earth import EARTH_RATE
 from imudrv.site import Site

@@ -23,9 +23,20 @@ from imudrv.files import settings_file
 from imudrv.nav.attitude import rotation
 from imudrv.records import Flag, Records
 from imudrv.sensor_calibration import number_paths
+from imudrv.site import Site
 from imudrv.units import ARCSEC
 from imudrv.wire.encode import StreamEncoder
-from tools.sensors_units import FACES, SITE, SimulatedUnit, new_unit, pulses_of, six_faces_turned
+from tools.psins_to_wire import FLOAT_PROFILE, convert
+from tools.sensors_accuracy import errors, golden_truth
+from tools.sensors_units import (
+    FACES,
+    SITE,
+    SimulatedUnit,
+    new_unit,
+    pulses_of,
+    six_faces_turned,
+    write_session,
+)
 
 PROFILE = profiles.load("imu50-rs422").model_copy(update={"sample_rate_hz": 100.0})
 LAYOUT = PROFILE.layout()
@@ -377,6 +388,59 @@ def test_a_knock_divides_a_rest(solve):
     assert short.duration_s < 5.0
     assert any("knock" in one.reason and one.what == "rest" for one in found.evidence.left)
     assert found.mark == "good"
+
+
+def test_a_rest_of_more_than_half_an_hour_is_divided():
+    long = [{"rest": {"duration_s": 2000.0}}]
+    pulses = sessions(new_unit(7, LAYOUT, six_faces_turned()[:4], rest_s=REST_S, rests={2: long}))
+    nominal = NominalScales(0.5 * ARCSEC, 2000.0)
+    found = read_evidence([lambda: iter(np.array_split(pulses, 5))], LAYOUT, nominal)
+    assert len(found.rests) == 5
+    assert [one.reason for one in found.left] == ["it is long: divided into two rests"]
+
+
+def test_dither_in_the_increments_is_taken_off_the_rates(tmp_path):
+    layout = profiles.load("imu50-rs422").layout()  # 1 kHz: the filter needs it
+    dither = {
+        "amplitude_arcsec": [20.0, 20.0, 20.0],
+        "frequency_hz": [395.0, 402.0, 410.0],
+        "in_increments": 1.0,
+        "case_reaction": 0.01,
+    }
+    unit = new_unit(5, layout, rest_s=REST_S, changes={"unit": {"dither": dither}})
+    path = write_session(unit, layout, tmp_path)
+    found = calibrate_sensors([path], site=SITE, unit=UNIT, profile="imu50-rs422")
+    assert found.evidence.is_dithered
+    truth = true_numbers(unit)
+    arms = [one for one in found.estimates if one.path.startswith("size_effect")]
+    # Without the filter they are wrong by up to 0.3 mm, 21 sigma.
+    assert max(abs(one.value - truth[one.path]) / one.sigma for one in arms) < 4.0
+
+
+def test_the_golden_set_gives_the_errors_that_were_injected(data, tmp_path):
+    convert(data / "imusysclbt.bin", tmp_path / "golden.raw")
+    site = Site(latitude_deg=34.0, longitude_deg=106.0, height_m=0.0)
+    found = calibrate_sensors(
+        [tmp_path / "golden.raw"],
+        site=site.model_copy(update={"gravity_m_s2": site.gravity}),
+        unit="golden",
+        profile=str(FLOAT_PROFILE),
+        options=SensorsOptions(pivot="fixed"),
+    )
+    worst = {name: np.abs(values).max() for name, values in errors(found, golden_truth()).items()}
+    limits = {  # of the contract
+        "gyro scale, ppm": 0.5,
+        "C_bg, arcsec": 0.3,
+        "gyro bias, deg/h": 1e-3,
+        "K, ppm": 0.5,
+        "a_i, arcsec": 0.3,
+        "bias, ug": 0.5,
+        "k2, ug/g^2": 0.5,
+        "arms, mm": 0.1,
+        "skew, ms": 0.005,
+    }
+    assert worst.keys() == limits.keys()
+    assert [name for name in worst if worst[name] > limits[name]] == []
 
 
 def test_frames_lost_while_carried_cost_that_motion(solve, session, result):
