@@ -22,6 +22,7 @@ from imudrv.capture import Capture
 from imudrv.errors import InputError
 from imudrv.files.atomic import sha256, unchanged
 from imudrv.profiles.schema import Profile
+from imudrv.recording.reader import Recording
 from imudrv.records import Records
 from imudrv.units import ARCSEC, NS
 from imudrv.wire.layout import Sensor, Values
@@ -177,7 +178,9 @@ def analyse_noise(
             "--from, --to: expected one capture, and a begin before the end, got "
             f"{len(paths)} of them and {begin_s:g} to {end_s:g} s"
         )
-    if calibration is not None and not isinstance(calibration, PriorCalibration):
+    if not isinstance(calibration, PriorCalibration) and (
+        calibration is not None or _have_calibrations(paths)
+    ):
         calibration = prior_calibration(paths, calibration)
     pyramid = Pyramid(len(CHANNELS))
     read: list[NoiseCapture] = []
@@ -186,8 +189,6 @@ def analyse_noise(
         try:
             with unchanged(path):  # a second pass is for the hash
                 opened = Capture(path, profile_of(profile), channel)
-                if calibration is None and opened.recording is not None and opened.recording.calibration:
-                    calibration = prior_calibration([path])
                 intervals.add(opened.layout.interval)
                 splitter = _splitter(opened, calibration)
                 for piece in opened.pulses(advance):
@@ -207,6 +208,11 @@ def analyse_noise(
     if len(intervals) > 1:
         raise InputError("captures: expected one sample rate, got several; analyse them one by one")
     return _result(pyramid.result(), float(intervals.pop()) * NS, tuple(read), calibration)
+
+
+def _have_calibrations(paths: Sequence[Path]) -> bool:
+    """Return whether all captures are recordings with a calibration."""
+    return all(path.suffix == ".mcap" and Recording(path).calibration_text is not None for path in paths)
 
 
 def _within(samples: Records, window_s: tuple[float, float] | None) -> Records:

@@ -20,9 +20,12 @@ from calib.noise.pyramid import BREAK, KEEP, SKIP, AllanVariance, Pyramid, defau
 from calib.noise.stretches import StretchSplitter
 from imudrv import profiles
 from imudrv.calibration import read_calibration
-from imudrv.records import PULSES, Flag, Records
+from imudrv.records import INCREMENTS, PULSES, Arrival, Flag, Records, Source
 from imudrv.sensor_calibration import GyroNoise
+from imudrv.sinks.base import Batch
+from imudrv.sinks.recorder import Recorder
 from imudrv.units import ARCSEC, DEG_PER_SQRT_H, UG
+from imudrv.wire.datagram import encode
 from imudrv.wire.encode import StreamEncoder
 
 Array = NDArray[np.float64]
@@ -276,6 +279,37 @@ def test_without_a_calibration_the_scale_factors_are_nominal_and_no_certificate_
     assert noise(folder / "rest.raw", "-o", folder / "none.yaml") == 2
     assert "give its file (--calibration)" in capsys.readouterr().err
     assert not (folder / "none.yaml").exists()
+
+
+def recording(path: Path, samples: Records, calibration: str) -> Path:
+    recorder = Recorder(
+        path,
+        layout=LAYOUT,
+        profile=profiles.content("imu50-rs422"),
+        calibration=calibration.encode(),
+        source=Source.SIMULATOR,
+        port="nowhere",
+        unit="50-0017",
+    )
+    encoder = StreamEncoder(LAYOUT)
+    for piece in np.split(samples, range(500, len(samples), 500)):
+        increments = np.zeros(len(piece), INCREMENTS)
+        increments["counter"] = piece["counter"]
+        recorder.arrived(Arrival(int(piece["elapsed_ns"][-1]), encoder.encode(piece).tobytes()))
+        recorder.publish(Batch(piece, increments, encode(increments, Source.SIMULATOR)))
+    recorder.close()
+    return path
+
+
+def test_recordings_have_their_calibration_which_has_to_be_the_same(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one = recording(tmp_path / "one.mcap", pulses(30.0), CERTIFICATE)
+    assert noise(one, "-o", tmp_path / "new.yaml") == 0
+    assert "nominal" not in capsys.readouterr().out
+    other = recording(tmp_path / "other.mcap", pulses(30.0, seed=2), CERTIFICATE.replace("2000.0", "2001.0"))
+    assert noise(one, other) == 2
+    assert "expected recordings made with one calibration" in capsys.readouterr().err
 
 
 def test_three_seconds_are_too_short(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
