@@ -27,9 +27,9 @@ function box(kind) {
   const made = element("div", { class: `box ${kind}` }, $("world")), [x, y, z] = SIZE;
   const faces = [
     ["Z", x, y, `translateZ(${z / 2}px)`], ["-Z", x, y, `rotateY(180deg) translateZ(${z / 2}px)`],
-    ["X", y, z, `rotateY(90deg) rotateZ(90deg) translateZ(${x / 2}px)`],
-    ["-X", y, z, `rotateY(-90deg) rotateZ(-90deg) translateZ(${x / 2}px)`],
-    ["Y", x, z, `rotateX(90deg) translateZ(${y / 2}px)`], ["-Y", x, z, `rotateX(-90deg) translateZ(${y / 2}px)`],
+    ["X", y, z, `rotateY(90deg) rotateZ(-90deg) translateZ(${x / 2}px)`],
+    ["-X", y, z, `rotateY(-90deg) rotateZ(90deg) translateZ(${x / 2}px)`],
+    ["Y", x, z, `rotateX(90deg) rotateZ(180deg) translateZ(${y / 2}px)`], ["-Y", x, z, `rotateX(-90deg) translateZ(${y / 2}px)`],
   ];
   for (const [name, w, h, transform] of faces) {
     const face = element("div", { class: `face ${name.replace("-", "n")}` }, made);
