@@ -128,6 +128,7 @@ const width = (text) => [...text].reduce((sum, c) => sum + (c > "\u2e80" ? 1.75 
 function drawText() {
   const lost = !socket || socket.readyState !== 1;
   for (const one of document.querySelectorAll("[data-label]")) one.textContent = label(one.dataset.label);
+  for (const one of document.querySelectorAll("[data-title]")) one.title = label(one.dataset.title);
   $("link").textContent = lost ? `○ ${label("lost")}` : `● ${label(acting ? "acting" : "viewing")}`;
   document.documentElement.lang = language.replace("_", "-");
   const big = lost ? label("lost") : ended ? label("over") : view ? inLanguage(view.big) : "";
