@@ -233,7 +233,7 @@ class SessionController:
                 if is_due and (shown := self._screen.shown) and (action := self._keys.action(shown)):
                     events += engine.handle(action)
                 if self._web is not None and time.monotonic() - web_s >= PERIOD_S:
-                    web_s = time.monotonic()
+                    web_s = max(web_s + PERIOD_S, time.monotonic() - PERIOD_S)  # no frame is made up for
                     if chosen := self._web.action(engine.view):
                         events += engine.handle(chosen)
                     self._web.show(with_port_state(engine.view, self._service.port_state))
@@ -247,6 +247,8 @@ class SessionController:
             self._recordings.record_closed()
             raise
         self._recordings.end()
+        if self._web is not None:
+            self._web.show(engine.view)  # the newest one may have come between two frames
         return last
 
     def _feed(self, engine: Engine, batch: Batch) -> tuple[Event, ...]:

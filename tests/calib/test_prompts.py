@@ -2,6 +2,7 @@
 
 import ast
 import json
+import re
 from collections.abc import Iterator
 from dataclasses import asdict
 from importlib import resources
@@ -13,6 +14,7 @@ import pytest
 import calib
 from calib.messages import LANGUAGES, Message, catalogue, english, language, message, text, verbatim
 from calib.procedure.events import Rejected
+from calib.reports.document import MARKS
 
 HEADLINE = 38  # characters: what a screen of 80 columns has in letters of three rows
 
@@ -31,12 +33,21 @@ def used() -> Iterator[tuple[str, set[str]]]:
                 yield str(key.value), {str(keyword.arg) for keyword in node.keywords}
 
 
+def on_the_page() -> set[str]:
+    """Keys of the labels of the page in a browser."""
+    page = Path(calib.__file__).parent / "bench" / "page"
+    names = set(re.findall(r'data-(?:label|title)="(\w+)"', (page / "index.html").read_text()))
+    for call in re.findall(r"label\(([^()]*)\)", (page / "console.js").read_text()):
+        names |= set(re.findall(r'"(\w+)"', call))
+    return {f"page_{name}" for name in names | set(MARKS)}
+
+
 @pytest.mark.parametrize("language", LANGUAGES)
 def test_the_code_and_every_catalogue_have_the_same_keys_with_the_same_values(language: str) -> None:
     texts = catalogue(language)
     calls = list(used())
 
-    assert {key for key, _ in calls} | {"separator"} == set(texts)
+    assert {key for key, _ in calls} | {"separator"} | on_the_page() == set(texts)
     for key, names in calls:
         assert placeholders(texts[key]) == names, key
 

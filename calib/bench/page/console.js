@@ -27,9 +27,9 @@ function box(kind) {
   const made = element("div", { class: `box ${kind}` }, $("world")), [x, y, z] = SIZE;
   const faces = [
     ["Z", x, y, `translateZ(${z / 2}px)`], ["-Z", x, y, `rotateY(180deg) translateZ(${z / 2}px)`],
-    ["X", y, z, `rotateY(90deg) rotateZ(90deg) translateZ(${x / 2}px)`],
-    ["-X", y, z, `rotateY(-90deg) rotateZ(-90deg) translateZ(${x / 2}px)`],
-    ["Y", x, z, `rotateX(90deg) translateZ(${y / 2}px)`], ["-Y", x, z, `rotateX(-90deg) translateZ(${y / 2}px)`],
+    ["X", y, z, `rotateY(90deg) rotateZ(-90deg) translateZ(${x / 2}px)`],
+    ["-X", y, z, `rotateY(-90deg) rotateZ(90deg) translateZ(${x / 2}px)`],
+    ["Y", x, z, `rotateX(90deg) rotateZ(180deg) translateZ(${y / 2}px)`], ["-Y", x, z, `rotateX(-90deg) translateZ(${y / 2}px)`],
   ];
   for (const [name, w, h, transform] of faces) {
     const face = element("div", { class: `face ${name.replace("-", "n")}` }, made);
@@ -128,6 +128,7 @@ const width = (text) => [...text].reduce((sum, c) => sum + (c > "\u2e80" ? 1.75 
 function drawText() {
   const lost = !socket || socket.readyState !== 1;
   for (const one of document.querySelectorAll("[data-label]")) one.textContent = label(one.dataset.label);
+  for (const one of document.querySelectorAll("[data-title]")) one.title = label(one.dataset.title);
   $("link").textContent = lost ? `○ ${label("lost")}` : `● ${label(acting ? "acting" : "viewing")}`;
   document.documentElement.lang = language.replace("_", "-");
   const big = lost ? label("lost") : ended ? label("over") : view ? inLanguage(view.big) : "";
