@@ -43,6 +43,36 @@ _COUNTED: Final = Layout(
 )
 
 
+class Ordering:
+    """Datagrams of one unit to its samples, each once and in the order of the counter.
+
+    Attributes
+    ----------
+    rejected_bytes : int
+        Number of bytes that belong to no valid datagram.
+    """
+
+    def __init__(self) -> None:
+        self.rejected_bytes = 0
+        self._decoder = DatagramDecoder()
+        self._tracker = SequenceTracker(_COUNTED)
+
+    @property
+    def counts(self) -> SampleCounts:
+        """Sample counts so far."""
+        return self._tracker.counts
+
+    def feed(self, data: bytes) -> Records:
+        """Return the samples in `data` that are new and in order."""
+        received = self._decoder.feed(data)
+        self.rejected_bytes += int(received.rejects["length"].sum())
+        frames = np.zeros(len(received.increments), FRAME)
+        frames["counter"] = received.increments["counter"]
+        frames["t_ns"] = np.arange(len(frames))  # index, returned as the arrival time of the good ones
+        in_order: Records = received.increments[self._tracker.feed(frames)["arrival_ns"]]
+        return in_order
+
+
 class Receiver(AbstractContextManager["Receiver"]):
     """Iterator over arrays of one or more samples as they arrive; made by `receive`.
 
@@ -56,19 +86,12 @@ class Receiver(AbstractContextManager["Receiver"]):
         See `receive`.
     timeout_s : float or None
         Longest wait, s; None: no limit.
-
-    Attributes
-    ----------
-    rejected_bytes : int
-        Number of received bytes that belong to no valid datagram.
     """
 
     def __init__(self, url: str, timeout_s: float | None) -> None:
-        self.rejected_bytes = 0
         self._timeout_s = timeout_s
-        self._decoder = DatagramDecoder()
-        self._tracker = SequenceTracker(_COUNTED)
-        self._ordered(b"")  # compiles the kernels before samples arrive
+        self._ordering = Ordering()
+        self._ordering.feed(b"")  # compiles the kernels before samples arrive
         parts = split(url, ("udp", "tcp", "serial", "zenoh"))
         self._is_packets = parts.scheme == "udp"
         self._device = _open(parts)
@@ -80,7 +103,17 @@ class Receiver(AbstractContextManager["Receiver"]):
     @property
     def counts(self) -> SampleCounts:
         """Sample counts so far."""
-        return self._tracker.counts
+        return self._ordering.counts
+
+    @property
+    def rejected_bytes(self) -> int:
+        """Number of received bytes that belong to no valid datagram."""
+        return self._ordering.rejected_bytes
+
+    @property
+    def is_open(self) -> bool:
+        """Whether more may come."""
+        return self._is_open
 
     def __iter__(self) -> Self:
         return self
@@ -101,7 +134,7 @@ class Receiver(AbstractContextManager["Receiver"]):
                 self.close()
             if not data and not self._is_packets:
                 self.close()
-            if len(increments := self._ordered(data)):
+            if len(increments := self._ordering.feed(data)):
                 return increments
         raise StopIteration
 
@@ -114,16 +147,6 @@ class Receiver(AbstractContextManager["Receiver"]):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-    def _ordered(self, data: bytes) -> Records:
-        """Return the samples in `data` that are new and in order."""
-        received = self._decoder.feed(data)
-        self.rejected_bytes += int(received.rejects["length"].sum())
-        frames = np.zeros(len(received.increments), FRAME)
-        frames["counter"] = received.increments["counter"]
-        frames["t_ns"] = np.arange(len(frames))  # index, returned as the arrival time of the good ones
-        in_order: Records = received.increments[self._tracker.feed(frames)["arrival_ns"]]
-        return in_order
 
 
 def receive(url: str, timeout_s: float | None = None) -> Receiver:

@@ -5,6 +5,7 @@ other output, and a receiver reads one.
 """
 
 import socket
+from collections import deque
 from pathlib import Path
 from threading import Thread
 from typing import Any, Final
@@ -16,6 +17,7 @@ from imudrv.wire.datagram import SIZE
 _AT_ONCE: Final = SIZE << 9
 _BUFFER: Final = 1 << 22
 _JOIN_S: Final = 1.0
+_MOST_ARRIVED: Final = 1 << 18  # of all units: five seconds of 50 at 1 kHz
 
 
 class Publication:
@@ -112,6 +114,37 @@ class Subscription:
             self._far.sendall(sample.payload.to_bytes())
         except OSError:
             return  # closed
+
+
+class Watch:
+    """The datagrams of all units whose keys match, such as ``imu50/**``.
+
+    Parameters
+    ----------
+    url : Url
+        See `Publication`; the key may have wildcards.
+    """
+
+    def __init__(self, url: Url) -> None:
+        zenoh = _zenoh(url)
+        self._session = _session(zenoh, url)
+        self._arrived: deque[tuple[str, bytes]] = deque(maxlen=_MOST_ARRIVED)
+        try:
+            self._subscriber = self._session.declare_subscriber(url.address, self._take)
+        except zenoh.ZError as error:
+            self._session.close()
+            raise InputError(f"{url.text}: expected a key such as imu50/**: {error}") from error
+
+    def take(self) -> list[tuple[str, bytes]]:
+        """Return key and datagrams of what has arrived since the last call."""
+        return [self._arrived.popleft() for _ in range(len(self._arrived))]
+
+    def close(self) -> None:
+        """Leave."""
+        self._session.close()
+
+    def _take(self, sample: Any) -> None:
+        self._arrived.append((str(sample.key_expr), sample.payload.to_bytes()))
 
 
 def _require_one(url: Url) -> None:

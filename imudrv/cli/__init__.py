@@ -12,6 +12,7 @@ COMMANDS: Final = {
     "demo": "Demonstrate service, bench procedure, certificate and verification on a simulated unit.",
     "doctor": "Diagnose why no data arrive from a unit, and say what to do.",
     "run": "Run the live service: data of a unit in, compensated increments out.",
+    "receive": "Count the samples that running services send, by unit.",
     "monitor": "Show a running service on the terminal.",
     "status": "Print the health of a running service; exit code 0 ok, 3 warning, 4 failure.",
     "decode": "Decode a capture to pulse increments.",

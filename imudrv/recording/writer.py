@@ -94,7 +94,9 @@ class McapWriter:
         data : bytes
             As the channel encodes it.
         """
-        self._put(self._message(channel, t_ns, data))
+        record = self._message(channel, t_ns, data)
+        self._file.write(record)
+        self._position += len(record)
 
     def finish(self) -> None:
         """Write the summary and the end of the file."""
@@ -130,10 +132,10 @@ class McapWriter:
         """Encode a message and count it."""
         sequence = self._sequences[channel]
         self._sequences[channel] = sequence + 1
+        if t_ns > self._last_ns:  # nearly always
+            self._last_ns = t_ns
         if t_ns < self._first_ns:
             self._first_ns = t_ns
-        if t_ns > self._last_ns:
-            self._last_ns = t_ns
         head = _MESSAGE.pack(Opcode.MESSAGE, _BODY + len(data), channel, sequence & 0xFFFFFFFF, t_ns, t_ns)
         return head + data
 

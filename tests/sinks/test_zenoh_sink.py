@@ -1,8 +1,10 @@
 """Datagrams over Zenoh, between two sessions on the loopback."""
 
 import json
+import re
 import socket
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from realtime import until
 
 import imudrv
 from imudrv import profiles
+from imudrv.cli import main
 from imudrv.errors import InputError
 from imudrv.records import Records
 from imudrv.sinks import open_sink
@@ -36,6 +39,13 @@ def urls(tmp_path: Path) -> tuple[str, str]:
         }
         (tmp_path / f"{name}.json5").write_text(json.dumps(config))
     return f"{KEY}?config={tmp_path / 'listen.json5'}", f"{KEY}?config={tmp_path / 'connect.json5'}"
+
+
+def is_listening(url: str) -> bool:
+    config = json.loads(Path(url.partition("config=")[2]).read_text())
+    with socket.socket() as caller:
+        port = int(config["listen"]["endpoints"][0].rpartition(":")[2])
+        return caller.connect_ex(("127.0.0.1", port)) == 0
 
 
 def test_what_is_published_arrives_bit_for_bit_also_at_a_subscriber_that_stalls(
@@ -70,6 +80,30 @@ def test_what_is_published_arrives_bit_for_bit_also_at_a_subscriber_that_stalls(
     for name in ("t_ns", "interval_ns", "dtheta_b", "dv_b", "flags"):
         assert np.array_equal(samples[name], expected[name])
     assert sink.state.dropped == 0
+
+
+def test_several_units_are_counted_by_their_keys(
+    batch, urls: tuple[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    watch = Thread(
+        target=main, args=(["receive", urls[0].replace("bench3/50-0017", "**"), "--seconds", "2"],)
+    )
+    watch.start()
+    until(lambda: is_listening(urls[0]))
+    sinks = [open_sink(urls[1].replace("0017", number), LAYOUT) for number in ("0017", "0018")]
+    first = 0
+    while watch.is_alive():
+        for sink in sinks:
+            sink.publish(batch(first, 1))
+        first += 1
+        watch.join(0.002)
+    for sink in sinks:
+        sink.close()
+    last = capsys.readouterr().out.splitlines()[-2:]
+    for line, unit in zip(last, ("50-0017", "50-0018"), strict=True):
+        assert line.startswith(f"imu50/bench3/{unit}: ")
+        expected, good = (int(word) for word in re.findall(r"(\d+) (?:samples|good)", line))
+        assert expected == good > 0
 
 
 def test_nobody_need_listen(batch, urls: tuple[str, str]) -> None:
