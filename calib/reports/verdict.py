@@ -171,7 +171,7 @@ def _dither(result: LeverArmEstimate) -> Iterator[Mark]:
         if run.lines:
             lines = tuple(
                 message(
-                    "dither_line",
+                    "dither_of_gyro",
                     amplitude_arcsec=line.amplitude_rad / ARCSEC,
                     frequency_hz=line.frequency_hz,
                     axis=line.axis,
