@@ -7,6 +7,7 @@ In a notebook::
     calib.predict("three-rotations", site="site.yaml")
     result = calib.identify(["z.raw", "x.raw", "y.raw"], calibration="unit.yaml", site="site.yaml",
                             profile="imu50-rs422")
+    calib.calibrate_sensors(["session.raw"], site="site.yaml", unit="50-0017", profile="imu50-rs422")
     calib.validate("z.raw", calibration="unit.yaml", site="site.yaml", profile="imu50-rs422")
 
 Data flow; every module can be read alone::
@@ -18,11 +19,13 @@ Data flow; every module can be read alone::
     estimation      rotations aligned and navigated; lever arms from their velocities; accuracy of a plan
     lever_arms      gauges, and the formats of other programs
     identification  captures to an identification result
+    sensors         a new unit: scales, axes, biases and arms from rests and the motions between them
     alignment       a rest of a capture to level and heading, compared with the site
     result_file     the result as JSON      certificate  the result as a calibration file
 
     procedure       the bench procedure as data, and its state machine
     bench           a session with an operator: journal, recordings, screen
+    noise           Allan deviations of a long rest, and their coefficients
     validation      navigation with and without compensation, on recordings and simulated units
     dither          effect of gyro dither on the size effect
     reports         reports as text, for a terminal and as HTML
@@ -46,6 +49,10 @@ if TYPE_CHECKING:
     from calib.identification import EstimationOptions as EstimationOptions
     from calib.identification import identify as identify
     from calib.lever_arms.gauge import LeverArms as LeverArms
+    from calib.noise.analysis import analyse_noise as analyse_noise
+    from calib.sensors.calibrate import SensorsOptions as SensorsOptions
+    from calib.sensors.calibrate import calibrate_sensors as calibrate_sensors
+    from calib.sensors.prediction import predict_sensors as predict_sensors
 
 # Imported at first use, so that a program pays only for what it needs.
 _MODULES = {
@@ -53,10 +60,14 @@ _MODULES = {
     "LeverArms": "calib.lever_arms.gauge",
     "PlannedRotation": "calib.estimation.predict",
     "Session": "calib.bench.session",
+    "SensorsOptions": "calib.sensors.calibrate",
     "align": "calib.alignment",
+    "analyse_noise": "calib.noise.analysis",
+    "calibrate_sensors": "calib.sensors.calibrate",
     "identify": "calib.identification",
     "load_procedure": "calib.api",
     "predict": "calib.api",
+    "predict_sensors": "calib.sensors.prediction",
     "validate": "calib.api",
 }
 __all__ = sorted(_MODULES)

@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.axes import axis_name
 from calib.detection.segments import find_segments
-from calib.estimation.runs import Priors
+from calib.estimation.priors import Priors
 from calib.identification import PriorCalibration, prior_calibration
 from calib.inputs import StrPath, profile_of, require_six_axes, site_of
 from imudrv.arrays import Array
@@ -100,7 +100,7 @@ class RestAlignment:
     @property
     def verdicts(self) -> tuple[tuple[str, str], ...]:
         """Mark and reason, the worst first."""
-        marks = [("bad", self.aligned.motion)] if self.aligned.motion else []
+        marks = [("bad", str(self.aligned.motion))] if self.aligned.motion else []
         for name, measured, of_site, sigma in (c for c in self.comparisons if not c.agrees):
             off = abs(measured - of_site) / sigma
             what_to_do = "check latitude, height and gravity of the site, and the calibration"

@@ -149,14 +149,19 @@ def check_target(path: Path, calibration: Calibration) -> None:
     InputError
         The file is the certificate of another unit, or of another kind.
     """
+    check_unit_file(path, calibration.serial_number)
+
+
+def check_unit_file(path: Path, unit: str) -> None:
+    """Check that the certificate of a unit may be written to a file, see `check_target`."""
     if not path.exists():
         return
-    wanted = f"{path}: expected the certificate of unit {calibration.serial_number!r}, or no file yet"
+    wanted = f"{path}: expected the certificate of unit {unit!r}, or no file yet"
     try:
         serial_number = read_calibration(path).serial_number
     except FaultyFileError:
         raise InputError(f"{wanted}, got a file that is no certificate; choose another name") from None
-    if serial_number != calibration.serial_number:
+    if serial_number != unit:
         raise InputError(f"{wanted}, got that of {serial_number!r}; choose another name")
 
 

@@ -6,7 +6,7 @@ Certificate and report are functions of `IdentificationResult` and compute nothi
 import hashlib
 import os
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from html import escape
 from importlib.metadata import version
@@ -17,9 +17,11 @@ import numpy as np
 
 from calib.detection.acceptance import RotationLimits
 from calib.estimation.joint import estimate_joint
+from calib.estimation.low_pass import FilterChoice
 from calib.estimation.plain import estimate_plain
+from calib.estimation.priors import Priors, certified_priors
 from calib.estimation.result import TO_DIFFERENCES, Extra, LeverArmEstimate, RunResult
-from calib.estimation.runs import CaptureRuns, Priors, Run, navigate_capture
+from calib.estimation.runs import CaptureRuns, NavigationOptions, Run, navigate_capture
 from calib.inputs import StrPath, profile_of, require_six_axes, site_of
 from calib.lever_arms.gauge import LeverArms
 from calib.messages import english
@@ -55,6 +57,12 @@ class EstimationOptions:
         Whether all nine components are required; needs a fixed pivot.
     extra : tuple of {'quadratic'}
         Additional parameters to estimate.
+    rate_filter : {'auto', 'causal', 'centred', 'dither'}
+        Filter of the rates of H; `auto`: `dither` wherever the sample rate allows it.
+    priors : Priors, optional
+        Uncertainty of the static calibration; default: that of the certificate, or else wide.
+    skew_sigma_s : float, optional
+        1-sigma of the gyro-accelerometer skew about that of the certificate; 0: known exactly.
 
     Raises
     ------
@@ -66,6 +74,9 @@ class EstimationOptions:
     pivot: Literal["free", "fixed"] = "free"
     nine: bool = False
     extra: tuple[Extra, ...] = ()
+    rate_filter: FilterChoice = "auto"
+    priors: Priors | None = None
+    skew_sigma_s: float | None = None
 
     def __post_init__(self) -> None:
         if self.method == "plain" and (self.pivot == "fixed" or self.nine or self.extra):
@@ -73,6 +84,13 @@ class EstimationOptions:
                 "method plain: expected pivot free, six components and no extra parameters, as it solves "
                 "V = H R only; use method joint"
             )
+
+    def priors_of(self, calibration: Calibration) -> Priors:
+        """Return the priors for a unit."""
+        priors = certified_priors(calibration)
+        if self.priors is not None:
+            priors = replace(self.priors, skew=priors.skew, expected_skew=priors.expected_skew)
+        return priors if self.skew_sigma_s is None else replace(priors, skew=self.skew_sigma_s)
 
 
 class PriorCalibration(NamedTuple):
@@ -261,7 +279,8 @@ def identify(
     paths = _paths(captures)
     if not isinstance(calibration, PriorCalibration):
         calibration = prior_calibration(paths, calibration)
-    site, priors, limits = site_of(site), Priors(), RotationLimits()
+    site, limits = site_of(site), RotationLimits()
+    priors = options.priors_of(calibration.calibration)
     sources: list[CaptureSummary] = []
     for path in paths:
         source = _read(
@@ -269,6 +288,7 @@ def identify(
             _label(path, [source.label for source in sources]),
             calibration=calibration.calibration.without_size_effect().without_skew(),
             site=site,
+            navigation=NavigationOptions(limits, priors, rate_filter=options.rate_filter),
             profile=profile_of(profile),
             channel=channel,
             advance=advance,
@@ -363,6 +383,7 @@ def _read(
     *,
     calibration: Calibration,
     site: Site,
+    navigation: NavigationOptions,
     profile: Profile | None,
     channel: str | None,
     advance: Callable[[int], None],
@@ -381,7 +402,7 @@ def _read(
         with unchanged(path):  # two passes, and one for the hash
             capture = Capture(path, profile, channel)
             layout = require_six_axes(capture.layout)
-            rotations = navigate_capture(pulses, layout, calibration, site, label)
+            rotations = navigate_capture(pulses, layout, calibration, site, label, navigation)
             digest = sha256(path)
     except InputError as error:
         raise error if str(path) in str(error) else InputError(f"{path}: {error}") from None

@@ -4,7 +4,12 @@ import numpy as np
 
 from calib.detection.blocks import Block, BlockSums
 from calib.detection.tracking import AttitudeTracker, RestAverages, RotationTracker, StillnessDetector
-from imudrv.records import INCREMENTS
+from calib.noise.pyramid import Pyramid
+from calib.noise.stretches import StretchSplitter
+from calib.sensors.motion import SAMPLE, integrate
+from calib.sensors.parameters import Parameters
+from imudrv.records import INCREMENTS, PULSES
+from imudrv.sim.path import minimum_jerk
 
 
 def detection() -> None:
@@ -21,3 +26,20 @@ def detection() -> None:
     attitude.lean(up)
     attitude.azimuth(up)
     _ = turned.axis_tilt
+
+
+def noise() -> None:
+    """Allan deviations of a rest."""
+    splitter, pyramid = StretchSplitter(1.0, np.ones(6), np.ones(6)), Pyramid(6)
+    splitter.feed(np.ones(1, PULSES))
+    pyramid.feed(*splitter.close())
+    pyramid.end_stretch()
+
+
+def sensors() -> None:
+    """Motions between rests."""
+    samples = np.zeros(3, SAMPLE)
+    samples["T"] = 1e-3
+    still = np.zeros(3), np.zeros(3)
+    integrate(samples, Parameters(9.8, np.zeros(2)), still, still)
+    minimum_jerk(0.5)

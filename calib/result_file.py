@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from calib.detection.turns import Turn
-from calib.estimation.result import LeverArmEstimate
-from calib.estimation.runs import Priors, Run
+from calib.estimation.priors import Priors
+from calib.estimation.result import ChiSquare, LeverArmEstimate
+from calib.estimation.runs import Run
 from calib.identification import CaptureSummary, IdentificationResult, scatter
 from calib.lever_arms.gauge import LeverArms
 from calib.messages import english
@@ -56,8 +57,7 @@ def result_document(identification: IdentificationResult, arms: LeverArms) -> di
         "noise": {
             "angle_walk_rad_per_sqrt_s": result.noise.angle_walk,
             "velocity_walk_m_s_per_sqrt_s": result.noise.velocity_walk,
-            "velocity_white_m_s": result.noise.velocity_white,
-            "velocity_pulse_m_s": result.noise.velocity_pulse,
+            "degrees_of_freedom": result.noise.degrees_of_freedom,
         },
         "parameters_si": [
             {
@@ -76,6 +76,8 @@ def result_document(identification: IdentificationResult, arms: LeverArms) -> di
                 "run": one.label,
                 "rank": one.rank,
                 "shift_mm": None if one.shift_m is None else (one.shift_m / MM).tolist(),
+                "shift_sigma_mm": None if one.sigma_m is None else (one.sigma_m / MM).tolist(),
+                "test": None if one.test is None else _test(one.test),
             }
             for one in result.leave_one_out
         ],
@@ -93,6 +95,15 @@ def result_document(identification: IdentificationResult, arms: LeverArms) -> di
                     for turn, gained in zip(run.turns, outcome.turns, strict=True)
                 ],
                 "H_rest_m_s_per_m": outcome.H_rest,
+                "rate_filter": outcome.rate_filter,
+                "dither": [
+                    {
+                        "axis": line.axis,
+                        "frequency_hz": line.frequency_hz,
+                        "amplitude_arcsec": line.amplitude_rad / ARCSEC,
+                    }
+                    for line in outcome.lines
+                ],
                 "t_s": outcome.t_s.tolist(),
                 "v_n_m_s": outcome.v_n.tolist(),
                 "fitted_n_m_s": outcome.fitted_n.tolist(),
@@ -133,6 +144,16 @@ def inputs_document(identification: IdentificationResult) -> dict[str, Any]:
     }
 
 
+def _test(test: ChiSquare) -> dict[str, Any]:
+    """Return a chi-square test; without degrees of freedom there was nothing to test."""
+    return {
+        "chi_square": test.value,
+        "degrees_of_freedom": test.degrees_of_freedom,
+        "band_95": list(test.band),
+        "p_value": test.p_value,
+    }
+
+
 def _capture(source: CaptureSummary) -> dict[str, Any]:
     rotations = source.rotations
     return {
@@ -144,22 +165,32 @@ def _capture(source: CaptureSummary) -> dict[str, Any]:
         "samples": source.counts,
         "temperature_degc": {t.channel: [t.least_degc, t.most_degc] for t in source.temperatures},
         "runs": [run.label for run in rotations.runs],
+        "restarts_s": list(rotations.restarts_s),
         "rejected": [
-            {"start_s": rotation.start_s, "stop_s": rotation.stop_s, "reasons": [*map(english, reasons)]}
+            {
+                "start_s": rotation.start_s,
+                "stop_s": rotation.stop_s,
+                "reasons": [*map(english, reasons)],
+                "messages": [*map(asdict, reasons)],
+            }
             for rotation, reasons in rotations.rejected
         ],
     }
 
 
-def _priors(priors: Priors) -> dict[str, float]:
+def _priors(priors: Priors) -> dict[str, Any]:
     return {
+        "from_certificate": priors.covariance is not None,
         "accelerometer_bias_ug": priors.accelerometer_bias / UG,
         "accelerometer_scale_ppm": priors.accelerometer_scale / PPM,
         "accelerometer_misalignment_urad": priors.accelerometer_misalignment / URAD,
         "gyro_bias_deg_per_h": priors.gyro_bias / DEG_PER_H,
         "gyro_scale_ppm": priors.gyro_scale / PPM,
         "gyro_misalignment_urad": priors.gyro_misalignment / URAD,
+        "accelerometer_bias_of_run_ug": priors.accelerometer_bias_of_run / UG,
+        "gyro_bias_of_run_deg_per_h": priors.gyro_bias_of_run / DEG_PER_H,
         "skew_s": priors.skew,
+        "expected_skew_s": priors.expected_skew,
         "quadratic_ug_per_g2": priors.quadratic * STANDARD_GRAVITY**2 / UG,
         "arm_mm": priors.arm / MM,
     }
@@ -174,8 +205,9 @@ def outcome_document(result: LeverArmEstimate) -> dict[str, Any]:
         "rank": result.rank,
         "direction_sigma_mm": (result.direction_sigma / MM).tolist(),
         "singular_values_m_s_per_m": result.singular_values.tolist(),
-        "chi_square": result.chi_square,
-        "degrees_of_freedom": result.degrees_of_freedom,
+        "scatter": None if result.scatter is None else _test(result.scatter),
+        "redundancy": _test(result.redundancy),
+        "dither_error_sigma": result.dither_error,
         "residual_scatter_mm_s": {run.label: scatter(run) / MM for run in result.runs},
     }
 
@@ -192,7 +224,7 @@ def _profile(run: Run) -> dict[str, Any]:
             "heading_deg": aligned.heading_rad / DEG,
             "heading_sigma_deg": aligned.heading_sigma_rad / DEG,
             "level_sigma_arcsec": aligned.level_sigma_rad / ARCSEC,
-            "motion": aligned.motion,
+            "motion": None if aligned.motion is None else str(aligned.motion),
         },
     }
 
@@ -202,6 +234,7 @@ def _turn(turn: Turn) -> dict[str, Any]:
     return {
         "accepted": turn.accepted,
         "reasons": [*map(english, turn.reasons)],
+        "messages": [*map(asdict, turn.reasons)],
         "start_s": turn.start_s,
         "stop_s": turn.stop_s,
         "angle_deg": turn.angle_deg,

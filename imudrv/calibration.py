@@ -17,16 +17,18 @@ from imudrv.files.model import Matrix3, Model, UtcTime
 from imudrv.files.settings_file import SettingsFile, read_file, write
 from imudrv.imu.coefficients import Coefficients, TemperatureTerms
 from imudrv.sensor_calibration import Noise, SensorsProvenance, number_paths
-from imudrv.units import ARCSEC, DEG_PER_H, MM, PPM, UG
+from imudrv.units import ARCSEC, DEG_PER_H, MM, MS, PPM, STANDARD_GRAVITY, UG
 
 NORM_TOLERANCE: Final = 0.1
-"""Largest deviation from 1 of the length of a row or column of an axes matrix."""
-MIN_DETERMINANT: Final = 0.5
-"""Smallest determinant of an axes matrix: axes may be turned, but neither mirrored nor parallel."""
+"""Largest deviation from 1 of the length of a sensing axis, a row of the inverse of an axes matrix."""
+MIN_DETERMINANT: Final = 0.3
+"""Smallest determinant of the sensing axes: they may be any that span space, but not mirrored."""
 GAUGE_TOLERANCE_MM: Final = 1e-5
 """Largest deviation from the stated gauge: ten times the rounding to six decimals."""
 COVARIANCE_TOLERANCE_MM2: Final = 5e-6
 """Largest asymmetry and negative eigenvalue of a covariance: nine entries, each rounded to six decimals."""
+_NONE: Final = (0.0, 0.0, 0.0)
+
 MAX_PROVENANCE: Final = 1 << 18
 """Largest provenance, characters of JSON."""
 PROVENANCE_SENSORS: Final = "sensors"
@@ -38,18 +40,23 @@ Matrix9: TypeAlias = tuple[Row9, Row9, Row9, Row9, Row9, Row9, Row9, Row9, Row9]
 
 def _axes(matrix: Matrix3) -> Matrix3:
     C = np.array(matrix)
-    with np.errstate(over="ignore"):  # infinity is reported below
-        norms = np.concatenate([np.linalg.norm(C, axis=1), np.linalg.norm(C, axis=0)])
+    with np.errstate(over="ignore", invalid="ignore"):
+        determinant = float(np.linalg.det(C))
+    if not 1e-6 < abs(determinant) < 1e6:
+        raise ValueError(f"expected three independent axes, got a matrix of determinant {determinant:.3g}")
+    sensing = np.linalg.inv(C)  # rows: the sensing axes
+    norms = np.linalg.norm(sensing, axis=1)
     worst = norms[np.argmax(np.abs(norms - 1.0))]
     if abs(worst - 1.0) > NORM_TOLERANCE:
         raise ValueError(
-            f"expected rows and columns of a length within {NORM_TOLERANCE:g} of 1, got one of {worst:.4g}; "
-            "scale belongs to the scale factors"
+            f"expected rows of the inverse, the sensing axes, of a length within {NORM_TOLERANCE:g} of 1, "
+            f"got one of {worst:.4g}; scale belongs to the scale factors"
         )
-    determinant = np.linalg.det(C)
+    determinant = float(np.linalg.det(sensing))
     if abs(determinant) < MIN_DETERMINANT:
         raise ValueError(
-            f"expected three independent axes, determinant >= {MIN_DETERMINANT:g}, got {determinant:.3g}"
+            "expected three independent sensing axes, determinant of the inverse >= "
+            f"{MIN_DETERMINANT:g}, got {determinant:.3g}"
         )
     if determinant < 0.0:
         raise ValueError(
@@ -399,13 +406,7 @@ def coefficients(calibration: Calibration) -> Coefficients:
     -------
     Coefficients
         SI.
-
-    Raises
-    ------
-    InputError
-        The calibration has terms that this version does not compensate.
     """
-    _require_compensable(calibration)
     gyro, accelerometer, terms = calibration.gyro, calibration.accelerometer, calibration.temperature
     return Coefficients(
         gyro_scale=_array(gyro.scale_arcsec_per_pulse or gyro.scale, ARCSEC if gyro.scale is None else 1.0),
@@ -425,21 +426,9 @@ def coefficients(calibration: Calibration) -> Coefficients:
         )
         if terms
         else None,
+        quadratic=_array(accelerometer.quadratic_ug_per_g2 or _NONE, UG / STANDARD_GRAVITY**2),
+        asymmetry=_array(accelerometer.asymmetry_ppm or _NONE, PPM),
+        skew_s=(calibration.skew_ms or 0.0) * MS,
         gyro_in_pulses=gyro.scale is None,
         accelerometer_in_pulses=accelerometer.scale is None,
     )
-
-
-def _require_compensable(calibration: Calibration) -> None:
-    """Refuse terms that would be left in the increments without a word."""
-    accelerometer = calibration.accelerometer
-    terms = {
-        "accelerometer.quadratic_ug_per_g2": accelerometer.quadratic_ug_per_g2 or (),
-        "accelerometer.asymmetry_ppm": accelerometer.asymmetry_ppm or (),
-        "skew_ms": (calibration.skew_ms or 0.0,),
-    }
-    if left := [name for name, values in terms.items() if any(values)]:
-        raise InputError(
-            f"calibration of unit {calibration.serial_number!r}: expected no {' or '.join(left)}, which this "
-            "version does not compensate, got one; use a version that does, or a certificate without"
-        )

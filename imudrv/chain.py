@@ -121,6 +121,11 @@ class Chain:
         """Whether two calibrations are in use, see `replace_calibration`; the kernels know only one."""
         return self._next is not None or self._repeats
 
+    @property
+    def leaves_out_skew(self) -> bool:
+        """Whether the rate filter does not compensate the skew of the calibration."""
+        return self._compensator.leaves_out_skew
+
     def allow_valid(self, valid: bool) -> None:
         """Set whether increments may be flagged as valid, from now on."""
         self._flow["flags"] = _ALL_FLAGS if valid else ~Flag.VALID & _ALL_FLAGS

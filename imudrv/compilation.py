@@ -30,6 +30,7 @@ PARTS: Final = (
     "logs",
     "recordings",
     "bench",
+    "allan_deviations",
 )
 """Functions of `imudrv.kernel_parts`: the long ones and those that others are made of come first."""
 

@@ -132,8 +132,15 @@ def recordings() -> None:
 
 
 def bench() -> None:
-    """Detection of rests and rotations; its package is the layer above this one."""
-    import_module("calib.kernel_parts").detection()
+    """Detection of rests and rotations, and motions; their package is the layer above this one."""
+    parts = import_module("calib.kernel_parts")
+    parts.detection()
+    parts.sensors()
+
+
+def allan_deviations() -> None:
+    """Noise of a rest, likewise."""
+    import_module("calib.kernel_parts").noise()
 
 
 class _Reporter(_events.Listener):  # type: ignore[misc]

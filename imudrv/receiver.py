@@ -25,6 +25,7 @@ from imudrv.posix import require_posix
 from imudrv.profiles.schema import SerialLine
 from imudrv.records import FRAME, Records
 from imudrv.sinks.serial import BAUDRATE
+from imudrv.streams import Subscription
 from imudrv.url import Url, device_path, host_and_port, serial_settings, split
 from imudrv.wire.datagram import DatagramDecoder
 from imudrv.wire.layout import Layout, Sequence, SequenceKind
@@ -42,6 +43,36 @@ _COUNTED: Final = Layout(
 )
 
 
+class Ordering:
+    """Datagrams of one unit to its samples, each once and in the order of the counter.
+
+    Attributes
+    ----------
+    rejected_bytes : int
+        Number of bytes that belong to no valid datagram.
+    """
+
+    def __init__(self) -> None:
+        self.rejected_bytes = 0
+        self._decoder = DatagramDecoder()
+        self._tracker = SequenceTracker(_COUNTED)
+
+    @property
+    def counts(self) -> SampleCounts:
+        """Sample counts so far."""
+        return self._tracker.counts
+
+    def feed(self, data: bytes) -> Records:
+        """Return the samples in `data` that are new and in order."""
+        received = self._decoder.feed(data)
+        self.rejected_bytes += int(received.rejects["length"].sum())
+        frames = np.zeros(len(received.increments), FRAME)
+        frames["counter"] = received.increments["counter"]
+        frames["t_ns"] = np.arange(len(frames))  # index, returned as the arrival time of the good ones
+        in_order: Records = received.increments[self._tracker.feed(frames)["arrival_ns"]]
+        return in_order
+
+
 class Receiver(AbstractContextManager["Receiver"]):
     """Iterator over arrays of one or more samples as they arrive; made by `receive`.
 
@@ -55,29 +86,34 @@ class Receiver(AbstractContextManager["Receiver"]):
         See `receive`.
     timeout_s : float or None
         Longest wait, s; None: no limit.
-
-    Attributes
-    ----------
-    rejected_bytes : int
-        Number of received bytes that belong to no valid datagram.
     """
 
     def __init__(self, url: str, timeout_s: float | None) -> None:
-        self.rejected_bytes = 0
         self._timeout_s = timeout_s
-        self._decoder = DatagramDecoder()
-        self._tracker = SequenceTracker(_COUNTED)
-        self._ordered(b"")  # compiles the kernels before samples arrive
-        parts = split(url, ("udp", "tcp", "serial"))
+        self._ordering = Ordering()
+        self._ordering.feed(b"")  # compiles the kernels before samples arrive
+        parts = split(url, ("udp", "tcp", "serial", "zenoh"))
         self._is_packets = parts.scheme == "udp"
         self._device = _open(parts)
-        self._receive = receiver_of(self._device)
+        self._receive = (
+            self._device.recv if isinstance(self._device, Subscription) else receiver_of(self._device)
+        )
         self._is_open = True
 
     @property
     def counts(self) -> SampleCounts:
         """Sample counts so far."""
-        return self._tracker.counts
+        return self._ordering.counts
+
+    @property
+    def rejected_bytes(self) -> int:
+        """Number of received bytes that belong to no valid datagram."""
+        return self._ordering.rejected_bytes
+
+    @property
+    def is_open(self) -> bool:
+        """Whether more may come."""
+        return self._is_open
 
     def __iter__(self) -> Self:
         return self
@@ -98,7 +134,7 @@ class Receiver(AbstractContextManager["Receiver"]):
                 self.close()
             if not data and not self._is_packets:
                 self.close()
-            if len(increments := self._ordered(data)):
+            if len(increments := self._ordering.feed(data)):
                 return increments
         raise StopIteration
 
@@ -112,16 +148,6 @@ class Receiver(AbstractContextManager["Receiver"]):
     ) -> None:
         self.close()
 
-    def _ordered(self, data: bytes) -> Records:
-        """Return the samples in `data` that are new and in order."""
-        received = self._decoder.feed(data)
-        self.rejected_bytes += int(received.rejects["length"].sum())
-        frames = np.zeros(len(received.increments), FRAME)
-        frames["counter"] = received.increments["counter"]
-        frames["t_ns"] = np.arange(len(frames))  # index, returned as the arrival time of the good ones
-        in_order: Records = received.increments[self._tracker.feed(frames)["arrival_ns"]]
-        return in_order
-
 
 def receive(url: str, timeout_s: float | None = None) -> Receiver:
     """Receive the samples that `imudrv run --out` sends.
@@ -130,7 +156,8 @@ def receive(url: str, timeout_s: float | None = None) -> Receiver:
     ----------
     url : str
         ``udp://[HOST]:PORT`` listens, on the loopback unless another HOST of this machine is given;
-        ``tcp://HOST:PORT`` connects; ``serial:///dev/ttyUSB0?baudrate=921600`` opens a line.
+        ``tcp://HOST:PORT`` connects; ``serial:///dev/ttyUSB0?baudrate=921600`` opens a line;
+        ``zenoh://imu50/BENCH/UNIT?config=FILE`` subscribes to a unit.
     timeout_s : float, optional
         Longest wait for samples, s, after which the iteration ends; by default there is no limit.
 
@@ -149,7 +176,9 @@ def receive(url: str, timeout_s: float | None = None) -> Receiver:
     return Receiver(url, timeout_s)
 
 
-def _open(url: Url) -> socket.socket | serial.Serial:
+def _open(url: Url) -> socket.socket | serial.Serial | Subscription:
+    if url.scheme == "zenoh":
+        return Subscription(url)
     if url.scheme == "serial":
         return _open_line(url)
     host, port = host_and_port(url, LOOPBACK)

@@ -5,7 +5,7 @@ import errno
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
 from importlib.metadata import version
@@ -19,8 +19,21 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.text import Text
 
-OK, OUR_FAULT, BAD_INPUT, NOT_GOOD, INTERRUPTED = 0, 1, 2, 3, 130
-"""Exit codes."""
+OK, OUR_FAULT, BAD_INPUT, NOT_GOOD, FAILED, INTERRUPTED = 0, 1, 2, 3, 4, 130
+"""Exit codes, see `EXIT_CODES`."""
+
+EXIT_CODES: Final = """exit codes of every command:
+  0    done
+  1    defect of this product
+  2    bad input, or a damaged file
+  3    done, but the result is not good or not finished: no certificate, a bad verdict, a unit that moved,
+       an unfinished session, a status with warnings
+  4    failure in a status; not signed by a trusted key
+  130  interrupted
+"""
+
+SHELLS: Final = ("bash", "zsh", "tcsh")
+"""Shells whose completion is printed."""
 
 _BYTES: Final = re.compile("[\udc80-\udcff]+")
 """Bytes that Python could not decode."""
@@ -55,24 +68,52 @@ def run_program(
 
 
 def _run(package: str, description: str, commands: Mapping[str, str], arguments: Sequence[str]) -> int | None:
+    if len(arguments) == 2 and arguments[0] == "--print-completion" and arguments[1] in SHELLS:
+        _print_completion(_parser(package, description, commands, commands), arguments[1])
+        return OK
     name = next((argument for argument in arguments if not argument.startswith("-")), None)
+    parsed = _parser(package, description, commands, [name]).parse_args(arguments)
+    compile_all_at_first_miss()
+    code: int | None = _module(package, name).run(parsed) if name else None
+    return code
+
+
+def _parser(
+    package: str, description: str, commands: Mapping[str, str], loaded: Collection[str | None]
+) -> argparse.ArgumentParser:
+    """Return the parser of a program, with the arguments of some of its commands."""
     program = package.partition(".")[0]
     parser = _Parser(
-        prog=program, description=description, epilog=f"example: {program} {next(iter(commands))} --help"
+        prog=program,
+        description=description,
+        epilog=f"{EXIT_CODES}\nexample: {program} {next(iter(commands))} --help",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"{program} {version('imu50')}")
+    text = "print the completion of a shell, alone; needs imu50[completion]"
+    parser.add_argument("--print-completion", choices=SHELLS, default=argparse.SUPPRESS, help=text)
     subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
-    module = None
     for command, text in commands.items():
         subparser = subparsers.add_parser(command, help=text, description=text)
-        if command == name:
-            module = import_module(f"{package}.{command.replace('-', '_')}")
+        if command in loaded:
+            module = _module(package, command)
             subparser.epilog = f"example: {program} {command} {module.EXAMPLE}".rstrip()
             module.add_arguments(subparser)
-    parsed = parser.parse_args(arguments)
-    compile_all_at_first_miss()
-    code: int | None = module.run(parsed) if module else None
-    return code
+    return parser
+
+
+def _module(package: str, command: str) -> Any:
+    return import_module(f"{package}.{command.replace('-', '_')}")
+
+
+def _print_completion(parser: argparse.ArgumentParser, shell: str) -> None:
+    try:
+        import shtab
+    except ImportError:
+        raise InputError(
+            "--print-completion: expected the package shtab: pip install 'imu50[completion]'"
+        ) from None
+    sys.stdout.write(f"{shtab.complete(parser, shell)}\n")
 
 
 class _Parser(argparse.ArgumentParser):

@@ -28,6 +28,8 @@ URAD: Final = 1e-6
 """One microradian, rad."""
 PPM: Final = 1e-6
 """One part per million."""
+MS: Final = 1e-3
+"""One millisecond, s."""
 NS: Final = 1e-9
 """One nanosecond, s."""
 NS_PER_S: Final = 1_000_000_000

@@ -41,10 +41,16 @@ def embedded(path: Path) -> EmbeddedFile:
     return EmbeddedFile.of(path, path.read_bytes())
 
 
-def begin(folder: Path, profile: str = "imu50-rs422") -> Session:
+def begin(
+    folder: Path,
+    profile: str = "imu50-rs422",
+    unit: str = NOMINAL.serial_number,
+    bench: str = "",
+    operator: str = "",
+) -> Session:
     """A session whose unit's files are beside it."""
     papers = folder.parent
-    write_calibration(papers / "unit.yaml", NOMINAL)
+    write_calibration(papers / "unit.yaml", NOMINAL.model_copy(update={"serial_number": unit}))
     settings_file.write(papers / "site.yaml", Site(latitude_deg=28.2, longitude_deg=113.0, height_m=60.0))
     (papers / "bench.yaml").write_text(PROCEDURE)
     return Session.create(
@@ -54,6 +60,10 @@ def begin(folder: Path, profile: str = "imu50-rs422") -> Session:
         site=embedded(papers / "site.yaml"),
         profile=profile,
         port="/dev/ttyUSB0",
+        bench=EmbeddedFile.of("bench.yaml", f"{{format: imu50-bench, version: 1, bench: {bench}}}".encode())
+        if bench
+        else None,
+        operator=operator,
     )
 
 

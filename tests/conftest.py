@@ -1,3 +1,4 @@
+import os
 import random
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -8,6 +9,9 @@ from typing import TypeAlias
 
 import pytest
 from hypothesis import settings
+
+# As `calib` sets it; inherited by the workers and by the programs under test, which all share two cores.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # The first example of a test may compile kernels, which takes seconds.
 settings.register_profile("imu50", deadline=None)

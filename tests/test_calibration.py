@@ -199,12 +199,12 @@ def test_the_compensation_gets_what_the_certificate_says() -> None:
         (
             "gyro.C_bg",
             [[1.2, 0, 0], [0, 1, 0], [0, 0, 1]],
-            "gyro.C_bg: expected rows and columns of a length",
+            "gyro.C_bg: expected rows of the inverse, the sensing axes, of a length within 0.1 of 1",
         ),
         (
             "gyro.C_bg",
             [[0, 0, 0]] * 3,
-            "gyro.C_bg: expected rows and columns of a length within 0.1 of 1, got",
+            "gyro.C_bg: expected three independent axes, got a matrix of determinant 0",
         ),
         ("size_effect.gauge", "middle", "size_effect.gauge: expected 'centroid', 'x', 'y', 'z' or 'given'"),
         ("size_effect.r_mm.x", [1001, 0, 0], "size_effect.r_mm.x[0]: expected at most 1000"),
@@ -251,16 +251,28 @@ def test_a_mirror_matrix_is_a_fault_that_belongs_into_the_profile(
     assert "sign: -1" in words
 
 
-def test_axes_nearly_parallel_are_a_fault() -> None:
-    # Rows and columns all of length 1, 20 degrees between X and Y: determinant sin(20 deg) = 0.34.
-    c, s = math.cos(math.radians(35.0)), math.sin(math.radians(35.0))
-    parallel = [[c, s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]
-    # Rows of length 1, 30 degrees from square: the columns are sqrt(1.25) and sqrt(0.75) long.
-    oblique = [[1.0, 0.0, 0.0], [0.5, math.sqrt(0.75), 0.0], [0.0, 0.0, 1.0]]
-    assert "of a length within 0.1 of 1, got one of 0.866;" in fault(changed("gyro.C_bg", oblique))
-    assert "expected three independent axes, determinant >= 0.5, got 0.342" in fault(
-        changed("gyro.C_bg", parallel)
+def axes_at(degrees: float) -> list[list[float]]:
+    """Matrix of three sensing axes on a cone: each is `degrees` off the cone's axis."""
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    sensing = [[s * math.cos(k * math.tau / 3.0), s * math.sin(k * math.tau / 3.0), c] for k in range(3)]
+    matrix: list[list[float]] = np.linalg.inv(sensing).tolist()
+    return matrix
+
+
+def test_sensing_axes_may_be_any_that_span_space() -> None:
+    # a cone of 45 deg: determinant 0.919; of 20 deg: 0.286
+    content = changed("accelerometer.C_ba", axes_at(45.0))
+    assert np.allclose(np.linalg.norm(np.linalg.inv(content["accelerometer"]["C_ba"]), axis=1), 1.0)
+    parse(content, Calibration, "calibration")
+    assert "expected three independent sensing axes, determinant of the inverse >= 0.3, got 0.286" in fault(
+        changed("accelerometer.C_ba", axes_at(20.0))
     )
+
+
+def test_sensing_axes_have_the_length_1() -> None:
+    # the rows of the matrix itself are of length 1, 30 degrees from square: its inverse's are longer
+    oblique = [[1.0, 0.0, 0.0], [0.5, math.sqrt(0.75), 0.0], [0.0, 0.0, 1.0]]
+    assert "of a length within 0.1 of 1, got one of 1.291;" in fault(changed("gyro.C_bg", oblique))
 
 
 def points(*rows: list[float], gauge: str) -> dict[str, Any]:
@@ -427,14 +439,14 @@ def test_a_fault_in_the_keys_of_the_sensors_is_named(document: dict[str, Any], w
     assert words in fault(document)
 
 
-@pytest.mark.parametrize(
-    "path", ["skew_ms", "accelerometer.quadratic_ug_per_g2", "accelerometer.asymmetry_ppm"]
-)
-def test_terms_that_are_not_compensated_yet_are_refused_where_increments_are_made(path: str) -> None:
-    size = 0.3 if path == "skew_ms" else [1.0, 0.0, 0.0]
-    with pytest.raises(InputError, match=f"50-0017.*expected no {path}, which this version does not comp"):
-        coefficients(calibration(changed(path, size)))
-    coefficients(calibration(changed(path, 0.0 if path == "skew_ms" else [0.0, 0.0, 0.0])))
+def test_the_terms_of_the_sensors_are_compensated_in_si() -> None:
+    terms = changed("accelerometer.quadratic_ug_per_g2", [10.0, 0.0, -20.0])
+    terms["accelerometer"]["asymmetry_ppm"], terms["skew_ms"] = [0.0, 5.0, 0.0], 0.3
+    c = coefficients(calibration(terms))
+    g = 9.80665  # 10 ug/g^2: at 1 g 10 ug
+    np.testing.assert_allclose(c.quadratic * g**2, np.array([10e-6, 0.0, -20e-6]) * g, rtol=1e-12)
+    np.testing.assert_allclose(c.asymmetry, [0.0, 5e-6, 0.0], rtol=1e-12)
+    assert c.skew_s == pytest.approx(3e-4, rel=1e-12)
 
 
 def test_identification_begins_without_the_skew_that_it_estimates() -> None:

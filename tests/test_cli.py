@@ -405,3 +405,21 @@ def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) 
         main(["--version"])
     assert end.value.code == 0
     assert capsys.readouterr().out == f"imudrv {version('imu50')}\n"
+
+
+@pytest.mark.parametrize("program", [main, calib.main], ids=["imudrv", "calib"])
+def test_help_lists_the_exit_codes_of_every_command(
+    program: Callable[[list[str]], int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        program(["--help"])
+    table = capsys.readouterr().out.partition("exit codes of every command:")[2]
+    assert re.findall(r"^  (\d+) ", table, re.MULTILINE) == ["0", "1", "2", "3", "4", "130"]
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "tcsh"])
+def test_a_shell_completes_commands_and_their_options(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--print-completion", shell]) == 0
+    completion = capsys.readouterr().out
+    for word in ("compensate", "rate-filter", "plot"):
+        assert word in completion

@@ -1,11 +1,14 @@
 """Recordings that another thread asks for while the service runs."""
 
+import subprocess
+import sys
 from pathlib import Path
 from threading import Thread
 from time import sleep
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from realtime import DEADLINE_S, until
 
 from imudrv.calibration import coefficients, write_calibration
@@ -268,3 +271,89 @@ def test_a_recording_continues_under_another_name_if_its_own_is_taken(tmp_path: 
     assert path.read_text() == "of another program"
     counters = np.concatenate(list(Recording(tmp_path / "run-2.mcap").increments()))["counter"]
     assert counters[-1] == own.samples - 1
+
+
+SHORT = """\
+format: imu50-scenario
+version: 1
+seed: 5
+site: {latitude_deg: 28.2, longitude_deg: 113.0, height_m: 60.0}
+motion: [{rest: {duration_s: 1}}]
+"""
+
+
+def short_run(folder: Path, own: Counted, warn: list[str], **options: object) -> Path:
+    """Record one second of a unit; return the recording."""
+    write_calibration(folder / "unit.yaml", NOMINAL)
+    (folder / "short.yaml").write_text(SHORT)
+    settings = Settings(
+        port=f"sim://{folder / 'short.yaml'}?speed=max",
+        profile="imu50-rs422",
+        calibration=str(folder / "unit.yaml"),
+        status=str(folder / "socket"),
+        record=str(folder / "run.mcap"),
+        **options,
+    )
+    Service(settings, lambda _: None, [own], warn=warn.append).run()
+    return folder / "run.mcap"
+
+
+def is_indexed(path: Path) -> bool:
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    return bool(summary.chunk_indexes)
+
+
+@pytest.mark.parametrize("packs", [True, False])
+def test_a_run_ends_by_packing_its_recording_unless_it_shall_not(tmp_path: Path, packs: bool) -> None:
+    path = short_run(tmp_path, Counted(), [], pack=packs)
+    assert is_indexed(path) == packs
+    assert sum(map(len, Recording(path).increments())) == 1000
+    assert not Recording(path).cut
+
+
+def test_a_recording_is_packed_when_the_outputs_are_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own, closed = Counted(), list[bool]()
+    monkeypatch.setattr("imudrv.service.loop.pack", lambda *_: closed.append(own.closed))
+    short_run(tmp_path, own, [])
+    assert closed == [True]
+
+
+@pytest.mark.parametrize("error", [InputError("disk full"), KeyboardInterrupt()])
+def test_a_recording_that_cannot_be_packed_stays_as_it_was_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
+    def fail(*_: Path) -> None:
+        raise error
+
+    monkeypatch.setattr("imudrv.service.loop.pack", fail)
+    warned: list[str] = []
+    path = short_run(tmp_path, Counted(), warned)
+    assert not Recording(path).cut
+    assert len(warned) == 1
+    assert "run.mcap: is complete, but" in warned[0]
+
+
+SLOW = """
+import time
+from pathlib import Path
+from imudrv.recording import pack, writer
+def sleep(*_):
+    print("packing", flush=True)
+    time.sleep(600)
+writer.ChunkedWriter.finish = sleep
+pack.pack(Path("run.mcap"), Path("run.mcap"))
+"""
+
+
+def test_a_kill_while_it_is_packed_leaves_the_recording(tmp_path: Path) -> None:
+    path = short_run(tmp_path, Counted(), [], pack=False)
+    content = path.read_bytes()
+    with subprocess.Popen([sys.executable, "-c", SLOW], cwd=tmp_path, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"packing\n"
+        process.kill()
+    assert path.read_bytes() == content

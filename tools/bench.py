@@ -5,6 +5,7 @@
     tools/run python tools/bench.py live|can [--seconds N] [--rounds N] [--json]
     tools/run python tools/bench.py nav [--rounds N] [--json]
     tools/run python tools/bench.py vh [--rounds N] [--json]
+    tools/run python tools/bench.py noise [--rounds N] [--hours H] [--json]
 
 A capture with damaged frames passes all stages, piece by piece, in one process on one core. Absolute figures
 depend on the machine and its load; the ratios are what to look at.
@@ -28,6 +29,7 @@ import numba
 import numpy as np
 from bench_live import TRANSPORTS, live
 from bench_nav import Measure, nav
+from bench_noise import against_allantools, long_record
 from bench_vh import vh
 from numpy.typing import NDArray
 from rich.console import Console
@@ -305,22 +307,27 @@ def main() -> None:
     parser.add_argument(
         "what",
         nargs="?",
-        choices=("stages", "live", "can", "nav", "vh"),
+        choices=("stages", "live", "can", "nav", "vh", "noise"),
         default="stages",
         help="default: stages of the driver",
     )
     parser.add_argument(
         "--rounds",
         type=int,
-        help="default: 12 over 5.4 minutes of samples; live 3 of each; nav 5 over an hour; vh 40",
+        help="default: 12 over 5.4 minutes of samples; live 3 of each; nav 5 over an hour; vh 40; noise 3",
     )
     parser.add_argument(
         "--seconds", type=int, default=20, help="duration of a live round (default: %(default)s)"
     )
+    parser.add_argument(
+        "--hours", type=float, default=1.0, help="length of the record of noise (default: %(default)s)"
+    )
     options = parser.parse_args()
-    rounds = options.rounds or {"stages": 12, "live": 3, "can": 3, "nav": 5, "vh": 40}[options.what]
-    if rounds < 1 or options.seconds < 1:
-        parser.error("--rounds, --seconds: expected 1 or more")
+    rounds = (
+        options.rounds or {"stages": 12, "live": 3, "can": 3, "nav": 5, "vh": 40, "noise": 3}[options.what]
+    )
+    if rounds < 1 or options.seconds < 1 or options.hours < 0.1:
+        parser.error("--rounds, --seconds: expected 1 or more; --hours: 0.1 or more")
     if options.what in TRANSPORTS:
         quantiles = live(TRANSPORTS[options.what], options.seconds, rounds)
         if options.json:
@@ -328,13 +335,20 @@ def main() -> None:
         else:
             show_live(quantiles)
         return
-    how, extra = f"{PIECE:,} samples at a time", {}
+    how, extra = f"{PIECE:,} samples at a time", dict[str, float]()
     if options.what == "nav":
         if importlib.util.find_spec("pyins") is None:
             parser.exit(2, "bench.py nav: expected python-ins for the comparison: pip install python-ins\n")
         measures, peak_mb = nav(rounds)
         how = f"an hour in the pieces of a capture, a row a second, peak memory {peak_mb:.0f} MB"
         extra = {"peak_mb": peak_mb}
+    elif options.what == "noise":
+        measures, record = [against_allantools(rounds)], long_record(options.hours)
+        how = (
+            f"one channel; six channels at rest for {options.hours:g} h at 1 kHz: {record['seconds']:.1f} s, "
+            f"{record['grown_mb']:.1f} MB more than after a minute"
+        )
+        extra = record
     elif options.what == "vh":
         measures = vh(rounds)
         how = f"200 s of damaged bytes, {1.0 / measures[0].ratio:.2f} times the time of C"

@@ -1,7 +1,11 @@
-"""Convert an IMU log of the PSINS toolbox (text, six integer increments a row) to wire bytes at 100 Hz.
+"""Convert an IMU log of the PSINS toolbox to wire bytes at 100 Hz.
+
+Text, six integer increments a row; or, as `.bin`, seven float32 a row: angles, velocities, time.
 
 tools/run python tools/psins_to_wire.py lasergyro.imu -o lasergyro.raw
 tools/run imudrv decode lasergyro.raw --profile tools/psins-100hz.yaml -o lasergyro.npz
+tools/run python tools/psins_to_wire.py imusysclbt.bin -o table.raw
+tools/run calib sensors table.raw --profile tools/psins-float-100hz.yaml --pivot fixed ...
 """
 
 import argparse
@@ -12,11 +16,13 @@ import numpy as np
 
 from imudrv import profiles
 from imudrv.errors import InputError
-from imudrv.records import PULSES, Records
+from imudrv.records import PULSES, Records, samples_type
 from imudrv.terminal import guarded
 from imudrv.wire.encode import StreamEncoder
 
 PROFILE = Path(__file__).with_name("psins-100hz.yaml")
+FLOAT_PROFILE = Path(__file__).with_name("psins-float-100hz.yaml")
+_COLUMNS = 7
 _INITIAL_ROWS = 3
 _CHUNK = 1 << 14
 
@@ -57,10 +63,43 @@ def read(path: Path) -> Records:
     return pulses
 
 
+def read_binary(path: Path) -> Records:
+    """Read the increments of a binary log: rows of seven float32, little-endian.
+
+    Parameters
+    ----------
+    path : Path
+        The log.
+
+    Returns
+    -------
+    ndarray of `imudrv.records.samples_type`
+        Increments in rad and m/s, numbered from 0.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or holds no whole number of rows.
+    """
+    try:
+        numbers = np.fromfile(path, "<f4")
+    except OSError as error:
+        raise InputError(f"{path}: expected a binary PSINS log, cannot read it: {error}") from error
+    if not len(numbers) or len(numbers) % _COLUMNS:
+        raise InputError(f"{path}: expected rows of {_COLUMNS} float32, got {len(numbers)} numbers")
+    rows = numbers.reshape(-1, _COLUMNS)
+    samples = np.zeros(len(rows), samples_type(gyro_pulses=False, accelerometer_pulses=False))
+    samples["counter"] = np.arange(len(rows))
+    samples["gyro"] = rows[:, :3]
+    samples["accelerometer"] = rows[:, 3:6]
+    return samples
+
+
 def convert(source: Path, output: Path) -> None:
     """Convert a log to wire bytes."""
-    encoder = StreamEncoder(profiles.load(str(PROFILE)).layout())
-    pulses = read(source)
+    is_binary = source.suffix == ".bin"
+    encoder = StreamEncoder(profiles.load(str(FLOAT_PROFILE if is_binary else PROFILE)).layout())
+    pulses = read_binary(source) if is_binary else read(source)
     with output.open("wb") as file:
         for at in range(0, len(pulses), _CHUNK):
             file.write(encoder.encode(pulses[at : at + _CHUNK]).tobytes())

@@ -1,19 +1,38 @@
 """After the steps: result, the operator's decision, activation of the certificate, and report."""
 
-from calib.bench.entries import ResidualVelocity
+from collections.abc import Iterator
+from typing import Final
+
+from calib.bench.entries import Decision
+from calib.bench.journal import journal_dates
 from calib.bench.keys import Keyboard
 from calib.bench.queue_sink import QueueReader
 from calib.bench.result import Result, identify_session
 from calib.bench.screen import OperatorScreen
 from calib.bench.session import Session
-from calib.bench.state import REPORT, RESULT
+from calib.bench.simulated_unit import is_rehearsal
+from calib.bench.state import JOURNAL, REPORT, RESULT
+from calib.bench.web_console import WebConsole
 from calib.certificate import check_target, write
 from calib.lever_arms.gauge import convert
-from calib.reports.identification import arms_text, report_html, verdict
+from calib.messages import Message, english, message
+from calib.procedure.events import Rejected, Skipped
+from calib.reports.certificate import Particulars
+from calib.reports.certificate import document as certificate_document
+from calib.reports.html import as_html
+from calib.reports.identification import arms_text
+from calib.reports.verdict import verdict
 from imudrv.calibration import Calibration, read_calibration
 from imudrv.errors import InputError
 from imudrv.files import atomic, settings_file
 from imudrv.files.atomic import atomic_write
+
+_MARKS: Final = {
+    "good": message("mark_good"),
+    "note": message("mark_note"),
+    "caution": message("mark_caution"),
+    "bad": message("mark_bad"),
+}
 
 
 def session_result(session: Session) -> Result:
@@ -33,15 +52,26 @@ def decide_alone(result: Result) -> bool:
     return all(mark != "bad" for mark, _ in verdict(result.identification))
 
 
-def ask_operator(unit: str, screen: OperatorScreen, keys: Keyboard, queue: QueueReader) -> bool:
+def ask_operator(
+    result: Result,
+    unit: str,
+    screen: OperatorScreen,
+    keys: Keyboard,
+    web: WebConsole | None,
+    queue: QueueReader,
+) -> bool:
     """Ask the operator whether to accept the result.
 
     Parameters
     ----------
+    result : Result
+        The result.
     unit : str
         Serial number.
     screen, keys
         The operator's terminal.
+    web : WebConsole or None
+        The operator's page.
     queue : QueueReader
         Emptied meanwhile; its samples are not needed.
 
@@ -55,21 +85,24 @@ def ask_operator(unit: str, screen: OperatorScreen, keys: Keyboard, queue: Queue
     ServiceEndedError
         The service has ended before the answer.
     """
-    screen.print(f"Accept it as the certificate of unit {unit}? [y/n]")
+    screen.say(message("accept", unit=unit))
     while not screen.is_idle:
         queue.take()
     keys.read()  # keys pressed before the question are no answer to it
-    while True:
+    if web is not None:
+        web.ask(result)
+    while (answer := keys.answer()) is None and (web is None or (answer := web.answer()) is None):
         queue.take()
-        for key in keys.read():
-            if key in "yn":
-                return key == "y"
+    if web is not None:
+        web.decided()
+    return answer
 
 
-def summary(result: Result) -> str:
-    """Return the text on which the operator decides."""
-    verdicts = [f"{mark}: {text}" for mark, text in verdict(result.identification)]
-    return "\n".join([arms_text(result.identification.arms), *verdicts])
+def summarise(result: Result, screen: OperatorScreen) -> None:
+    """Print what the operator needs for the decision."""
+    screen.print(arms_text(result.identification.arms))
+    for mark, text in verdict(result.identification):
+        screen.say(message("mark", mark=_MARKS[mark], text=text))
 
 
 def activate(session: Session, certificate: Calibration) -> None:
@@ -99,14 +132,58 @@ def activate(session: Session, certificate: Calibration) -> None:
         )
 
 
-def write_report(session: Session, result: Result, residual: ResidualVelocity | None) -> None:
-    """Write the report, with the verification after the result, and record its hash."""
-    arms = result.identification.arms
-    html = report_html(result.identification, (arms, convert(arms, "x")))
-    text = "The verification was skipped."
-    if residual is not None:
-        text = f"One more rotation with the new certificate: {residual}."
-    section = f"<section>\n<h2>Verification</h2>\n<p>{text}</p>\n</section>"
+def accepted_result(session: Session) -> tuple[Message, ...]:
+    """Return where the active certificate and the report are; empty if no result is accepted."""
+    decision = session.stage(Decision)
+    if decision is None or not decision.accepted:
+        return ()
+    return (
+        message("active_certificate", path=str(session.plan.certificate.path)),
+        message("report", path=str(session.folder / REPORT)),
+    )
+
+
+def write_report(session: Session, result: Result, verified: Message | None = None) -> None:
+    """Write the report and record its hash.
+
+    Parameters
+    ----------
+    session : Session
+        The session.
+    result : Result
+        Its result, accepted.
+    verified : Message, optional
+        Outcome of the verification; None: it is not done yet.
+    """
+    verified = message("verification_due") if verified is None else verified
+    arms, identification = result.identification.arms, result.identification
+    plan, simulated = session.plan, is_rehearsal(session.folder)
+    dates = journal_dates(session.folder / JOURNAL)
+    particulars = Particulars(
+        number=f"{plan.unit}-{identification.created:%Y%m%d}-{session.files[RESULT][:8]}",
+        bench=session.bench(),
+        operator=plan.operator or session.bench().operator,
+        procedure=f"{session.procedure().name}, SHA-256 {plan.procedure.sha256[:16]}, {plan.software}",
+        measured=" to ".join(dict.fromkeys(dates)),
+        attempts=tuple(_deviations(session)),
+        verified=verified,
+        is_simulated=simulated,
+    )
+    page = as_html(
+        certificate_document(identification, (arms, convert(arms, "x")), particulars),
+        number=particulars.number,
+        watermark="SIMULATED" if simulated else "",
+    )
     with atomic_write(session.path(REPORT)) as file:
-        file.write(html.replace("</section>", f"</section>\n{section}", 1).encode())
+        file.write(page.encode())
     session.record_file(REPORT)
+
+
+def _deviations(session: Session) -> Iterator[tuple[str, str]]:
+    """Return rejected attempts and skipped steps, and why."""
+    for entry in session.entries:
+        if isinstance(entry, Rejected):
+            why = "; ".join(map(english, entry.reasons))
+            yield f"rejected: {entry.step_id}, attempt {entry.attempt}", why
+        elif isinstance(entry, Skipped):
+            yield f"skipped: {entry.step_id}", "by the operator"

@@ -25,11 +25,12 @@ from typing import Final
 import numpy as np
 
 from calib.bench.completion import (
+    accepted_result,
     activate,
     ask_operator,
     decide_alone,
     session_result,
-    summary,
+    summarise,
     write_report,
 )
 from calib.bench.entries import Counted, Decision, ServiceMessage, SessionEnded, UnitDetected
@@ -41,9 +42,20 @@ from calib.bench.resume import require_temperature
 from calib.bench.screen import OperatorScreen, with_port_state
 from calib.bench.session import Session
 from calib.bench.state import REPORT
-from calib.messages import english
+from calib.bench.web_console import PERIOD_S, WebConsole
+from calib.messages import Message, english, message
 from calib.procedure.engine import Engine
-from calib.procedure.events import Aborted, Accepted, Conditions, Entered, Event, Finished, Phase, Rejected
+from calib.procedure.events import (
+    Aborted,
+    Accepted,
+    Conditions,
+    Entered,
+    Event,
+    Finished,
+    Phase,
+    Rejected,
+    View,
+)
 from calib.procedure.plan import steps_left, verification
 from calib.procedure.schema import VERIFICATION, Procedure
 from imudrv.errors import InputError
@@ -55,9 +67,6 @@ from imudrv.wire.layout import Layout, SequenceKind
 
 REDRAW_S: Final = 0.2
 """Interval at which the screen is redrawn and keys are read, s."""
-
-
-ABORT: Final = "q again: abort, accepted steps are kept. Any other key: continue"
 
 
 class SessionController:
@@ -76,17 +85,25 @@ class SessionController:
     screen, keys
         The operator's terminal.
     hands_free : bool
-        No keys are expected.
+        The steps need no keys.
+    accepts : bool
+        The result is accepted without a person, unless a verdict is bad.
     begin : callable
         Called with the procedure of the steps to do, before their samples are read; a rehearsal starts its
         unit then.
+    watch : callable
+        Called with each view; a simulated technician looks at it.
+    web : WebConsole or None
+        The operator's page, beside the terminal.
 
     Attributes
     ----------
     error : BaseException or None
         Error that ended the work.
-    outcome : str
+    outcome : tuple of Message
         Summary for the operator; empty if the session is not at its end.
+    is_undecided : bool
+        The result waits for a person to accept or reject it.
     """
 
     def __init__(
@@ -99,17 +116,22 @@ class SessionController:
         keys: Keyboard,
         *,
         hands_free: bool,
+        accepts: bool,
         begin: Callable[[Procedure], None],
+        watch: Callable[[View], None] = lambda _: None,
+        web: WebConsole | None = None,
     ) -> None:
         self.error: BaseException | None = None
-        self.outcome = ""
+        self.outcome: tuple[Message, ...] = ()
+        self.is_undecided = False
         self._session, self._layout, self._service = session, layout, service
         self._procedure = procedure = session.procedure()
         self._steps = {step.id: step for step in (*procedure.steps, *verification(procedure).steps)}
         self._sink, self._screen, self._keys = queue, screen, keys
         self._queue = QueueReader(queue, lambda text: session.append(ServiceMessage(text)))
         self._recordings = AttemptRecordings(session, service, self._queue)
-        self._hands_free, self._begin = hands_free, begin
+        self._hands_free, self._accepts, self._begin = hands_free, accepts, begin
+        self._watch, self._web = watch, web
         self._is_unit_detected = False
         self._conditions = Conditions()
         self._conditions_ns = 0
@@ -137,43 +159,53 @@ class SessionController:
             if last.reasons:
                 raise InputError(f"no result: {'; '.join(map(english, last.reasons))}; resume the session")
             session.append(last)
-        self._screen.print("Computing the lever arms from the recordings ...")
+        self._screen.say(message("computing"))
         result = session_result(session)
         if self._sink.is_closed:
             raise ServiceEndedError  # nothing is decided after Ctrl-C
-        if not self._is_accepted(result):
-            self.outcome = f"rejected; certificate unchanged: {session.plan.certificate.path}"
+        decision = self._decision(result)
+        if decision is None:
+            self.is_undecided = True
+            self._screen.say(message("undecided"))
+            return
+        if not decision.accepted:
+            path = str(session.plan.certificate.path)
+            self.outcome = (message("result_rejected", path=path),)
             return
         activate(session, result.certificate)
+        if REPORT not in session.files:
+            write_report(session, result)
+        for line in accepted_result(session):
+            self._screen.say(line)
         last = self._run_steps(verification(self._procedure))
         if isinstance(last, Aborted):
             return
         residual = None
         if VERIFICATION in last.accepted:
             residual = residual_velocity(session, result.certificate)
-        write_report(session, result, residual)
+        verified = message("verification_skipped") if residual is None else residual.message
+        write_report(session, result, verified)
         session.end(SessionEnded(residual))
-        self.outcome = (
-            f"active certificate: {session.plan.certificate.path}\n"
-            f"verification: {residual or 'skipped'}\n"
-            f"report: {session.folder / REPORT}"
-        )
+        self.outcome = (*accepted_result(session), message("verification", result=verified))
 
-    def _is_accepted(self, result: Result) -> bool:
-        """Return the decision in the journal, or take it now."""
+    def _decision(self, result: Result) -> Decision | None:
+        """Return the decision in the journal, or take it now; None: nobody is there."""
         decision = self._session.stage(Decision)
         if decision is None:
-            self._screen.print(summary(result))
-            if self._hands_free:
+            summarise(result, self._screen)
+            if self._accepts:
                 decision = Decision(decide_alone(result))
+            elif not self._keys.there and self._web is None:
+                return None
             else:
                 unit = self._session.plan.unit
-                decision = Decision(ask_operator(unit, self._screen, self._keys, self._queue))
+                answer = ask_operator(result, unit, self._screen, self._keys, self._web, self._queue)
+                decision = Decision(answer)
             if decision.accepted:
                 self._session.append(decision)
         if not decision.accepted:
             self._session.end(decision)
-        return decision.accepted
+        return decision
 
     def _run_steps(self, procedure: Procedure) -> Finished | Aborted:
         """Conduct the steps that are not accepted yet; on return all recordings are filed."""
@@ -193,22 +225,30 @@ class SessionController:
         if last is None:
             self._begin(steps_left(procedure, accepted))
         try:
-            shown_s = 0.0
+            shown_s = web_s = 0.0
             while last is None:
                 batch = self._queue.next()
                 events = () if batch is None else self._feed(engine, batch)
                 is_due = time.monotonic() - shown_s >= REDRAW_S
                 if is_due and (shown := self._screen.shown) and (action := self._keys.action(shown)):
                     events += engine.handle(action)
+                if self._web is not None and time.monotonic() - web_s >= PERIOD_S:
+                    web_s = max(web_s + PERIOD_S, time.monotonic() - PERIOD_S)  # no frame is made up for
+                    if chosen := self._web.action(engine.view):
+                        events += engine.handle(chosen)
+                    self._web.show(with_port_state(engine.view, self._service.port_state))
                 last = self._apply_events(engine, events)
                 if events or is_due:
                     shown_s = time.monotonic()
                     view = with_port_state(engine.view, self._service.port_state)
-                    self._screen.show(view, ABORT if self._keys.asks else "")
+                    self._watch(view)
+                    self._screen.show(view, self._keys.question)
         except ServiceEndedError:
             self._recordings.record_closed()
             raise
         self._recordings.end()
+        if self._web is not None:
+            self._web.show(engine.view)  # the newest one may have come between two frames
         return last
 
     def _feed(self, engine: Engine, batch: Batch) -> tuple[Event, ...]:
@@ -262,7 +302,7 @@ class SessionController:
                 self._session.append(event)
         return last
 
-    def _file(self, engine: Engine, event: Accepted) -> str:
+    def _file(self, engine: Engine, event: Accepted) -> Message | None:
         """File an accepted attempt; return why that is impossible."""
         log = next(log for log in reversed(engine.runs) if log.step_id == event.step_id)
         degc = self._conditions.temperature_degc

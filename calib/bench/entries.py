@@ -13,7 +13,7 @@ from typing import Annotated, Any, Final, Literal, Self, TypeAlias, get_args, ge
 from pydantic import AfterValidator, AwareDatetime, TypeAdapter, create_model
 from pydantic import Field as Key
 
-from calib.messages import verbatim
+from calib.messages import Message, message, verbatim
 from calib.procedure.events import (
     Aborted,
     Accepted,
@@ -38,7 +38,8 @@ MAX_COUNTER: Final = 1 << 53
 """Largest counter: exact in every JSON reader, and 285 000 years at 1 kHz."""
 
 
-def _printable(text: str) -> str:
+def printable(text: str) -> str:
+    """Return the text; raise `ValueError` if it is not printable."""
     if not text.isprintable():
         raise ValueError(f"expected printable text, got {text[:60]!r}")
     return text
@@ -61,7 +62,7 @@ Counter = Annotated[int, Key(ge=-1, le=MAX_COUNTER)]
 Count = Annotated[int, Key(ge=0, le=MAX_COUNTER)]
 Digest = Annotated[str, Key(pattern=r"^[0-9a-f]{64}$")]
 """SHA-256, hexadecimal."""
-Line = Annotated[str, Key(max_length=4096), AfterValidator(_printable)]
+Line = Annotated[str, Key(max_length=4096), AfterValidator(printable)]
 """Text that is printed in messages."""
 FileName = Annotated[str, Key(max_length=255), AfterValidator(_file_name)]
 """Name of a file in the session's folder; no path."""
@@ -128,6 +129,12 @@ class Plan:
         The unit's active certificate.
     procedure, site, profile : EmbeddedFile
         What is done, where, and the wire format of the unit.
+    bench : EmbeddedFile or None
+        Who calibrates, where and with what; None if there is no such file, and in older journals.
+    operator : str
+        Who conducts the session; empty if unknown.
+    host : str
+        Name of the computer; empty in older journals.
     """
 
     format: Literal["imu50-session"]
@@ -139,6 +146,9 @@ class Plan:
     procedure: UndamagedFile
     site: UndamagedFile
     profile: UndamagedFile
+    bench: UndamagedFile | None = None
+    operator: Line = ""
+    host: Line = ""
 
 
 @dataclass(frozen=True)
@@ -204,11 +214,11 @@ class ResidualVelocity:
     without: float
     compensated: float
 
-    def __str__(self) -> str:
-        """Return a phrase for the operator."""
-        return (
-            f"residual velocity after half a turn: {self.without / MM:.1f} mm/s without size-effect "
-            f"compensation, {self.compensated / MM:.1f} mm/s with it"
+    @property
+    def message(self) -> Message:
+        """Phrase for the operator."""
+        return message(
+            "residual_velocity", without_mm_s=self.without / MM, compensated_mm_s=self.compensated / MM
         )
 
 
@@ -280,7 +290,7 @@ _KINDS: Final = {name: kind for kind, name in _NAMES.items()}
 
 
 _OF_ENGINE: Final[Mapping[str, Any]] = {
-    "step_id": Annotated[str, Key(max_length=64), AfterValidator(_printable)],
+    "step_id": Annotated[str, Key(max_length=64), AfterValidator(printable)],
     "attempt": Annotated[int, Key(ge=0, le=1_000_000)],
     "counter": Counter,
     "first_counter": Count,

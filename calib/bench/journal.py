@@ -294,6 +294,13 @@ def read(path: Path) -> Contents:
     return Contents(entries, last, partial, signatures)
 
 
+def journal_dates(path: Path) -> tuple[str, str]:
+    """Return the dates, UTC, of the first and the last line of a journal."""
+    lines = atomic.content(path, MAX_JOURNAL, "a journal").splitlines()
+    first, last = (str(load_json(lines[k], str(path)).get("at", ""))[:10] for k in (0, -1))
+    return first, last
+
+
 def _check_place(entry: Entry, number: int, recorded: set[str], name: str) -> None:
     """Check that a line may be where it is."""
     if isinstance(entry, Plan) != (number == 1):

@@ -3,6 +3,7 @@
 import os
 import select
 import sys
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from queue import Empty, SimpleQueue
@@ -10,16 +11,42 @@ from threading import Thread
 from types import TracebackType
 from typing import Any, Final, Self
 
+from calib.messages import Message, message
 from calib.procedure.events import Abort, Action, Confirm, Redo, Skip, View
 from imudrv.posix import termios, tty
 
 BY_LINES: Final = termios is None
 """Whether the system delivers keys only line by line, each after Enter."""
 
-_ACTIONS: Final = {"\n": "confirm", "\r": "confirm", "r": "redo", "s": "skip", "q": "abort"}
+_POLL_S: Final = 0.05
+
+KEYS: Final = {
+    "\n": "confirm",
+    "\r": "confirm",
+    "r": "redo",
+    "s": "skip",
+    "b": "back",
+    "q": "abort",
+}
+"""Action of each key."""
+
+QUESTIONS: Final = {
+    "redo": message("ask_redo"),
+    "skip": message("ask_skip"),
+    "back": message("ask_back"),
+    "abort": message("ask_abort"),
+}
+"""What is asked before an action, because it gives work up."""
 
 
-_BY_STEP: Final[dict[str, Callable[[str], Action]]] = {"confirm": Confirm, "redo": Redo, "skip": Skip}
+def action_of(name: str, view: View) -> Action:
+    """Return the action of a name, for the step of a view in which it is possible."""
+    if name == "abort":
+        return Abort()
+    if name == "back":
+        return Redo(view.skipped[-1])
+    by_step: dict[str, Callable[[str], Action]] = {"confirm": Confirm, "redo": Redo, "skip": Skip}
+    return by_step[name](view.step_id)
 
 
 class Keyboard:
@@ -31,13 +58,14 @@ class Keyboard:
     ----------
     there : bool
         Whether there is a terminal.
-    asks : bool
-        Whether an abort has to be confirmed by another key.
+    question : Message or None
+        What the operator has to answer by y or n.
     """
 
     def __init__(self) -> None:
         self.there = sys.stdin.isatty()
-        self.asks = False
+        self.question: Message | None = None
+        self._asked: tuple[str, str] | None = None  # action and step
         self._fd = sys.stdin.fileno() if self.there else -1
         self._before: Any = None
         self._typed: SimpleQueue[str] = SimpleQueue()
@@ -70,7 +98,7 @@ class Keyboard:
         return "" if typed.startswith("\x1b") else typed.lower()
 
     def action(self, view: View) -> Action | None:
-        """Return the action of the keys typed, if it is possible now; an abort must be repeated.
+        """Return the action of the keys typed, if it is possible now and a question about it was answered.
 
         Parameters
         ----------
@@ -82,17 +110,27 @@ class Keyboard:
         Confirm, Redo, Skip, Abort or None
         """
         for key in self.read():
-            name = _ACTIONS.get(key)
-            asked, self.asks = self.asks, False
-            if name not in view.actions:
-                continue
-            if name == "abort":
-                if asked:
-                    return Abort()
-                self.asks = True
-                continue
-            return _BY_STEP[name](view.step_id)
+            asked, name = self._asked, KEYS.get(key)
+            self._asked = self.question = None
+            if asked is not None:
+                name, step_id = asked
+                if key == "y" and name in view.actions and step_id == view.step_id:
+                    return action_of(name, view)
+            elif name in QUESTIONS and name in view.actions:
+                self._asked, self.question = (name, view.step_id), QUESTIONS[name]
+            elif name is not None and name in view.actions:
+                return action_of(name, view)
         return None
+
+    def answer(self) -> bool | None:
+        """Return the answer to a question, by y or n; None: not yet."""
+        return next((key == "y" for key in self.read() if key in "yn"), None)
+
+    def wait_for_answer(self) -> bool:
+        """Return the answer to a question, see `answer`."""
+        while (answer := self.answer()) is None:
+            time.sleep(_POLL_S)
+        return answer
 
     def _read_lines(self) -> None:
         while line := os.read(self._fd, 1024):

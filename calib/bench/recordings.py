@@ -1,6 +1,7 @@
 """Recordings of the attempts of a session."""
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import fields
 
 import numpy as np
@@ -10,10 +11,12 @@ from calib.bench.queue_sink import QueueReader, ServiceEndedError
 from calib.bench.result import uncovered
 from calib.bench.session import Session
 from calib.bench.state import Attempt
+from calib.messages import Message, message
 from calib.procedure.events import Accepted, NavigationLog
 from calib.procedure.schema import Step
 from imudrv.errors import InputError
 from imudrv.files.atomic import atomic_write
+from imudrv.recording.pack import pack
 from imudrv.service.loop import Service
 
 
@@ -65,14 +68,17 @@ class AttemptRecordings:
             self.record_closed()
 
     def record_closed(self) -> None:
-        """Record the hash of the current recording, which the service has closed."""
+        """Pack the current recording, which the service has closed, and record its hash."""
         name, self._current = self._current, ""
         if name:
-            self._session.record_file(f"{name}.mcap")
+            path = self._session.folder / f"{name}.mcap"
+            with suppress(InputError):  # no room, or a damaged file: it stays as it was written
+                pack(path, path)
+            self._session.record_file(path.name)
 
     def file(
         self, step: Step, accepted: Accepted, log: NavigationLog, degc: Mapping[str, float | None]
-    ) -> str:
+    ) -> Message | None:
         """End the recording of an accepted attempt, check it, and write the attempt to the journal.
 
         Parameters
@@ -88,8 +94,8 @@ class AttemptRecordings:
 
         Returns
         -------
-        str
-            Why the attempt cannot be accepted; empty if it is.
+        Message or None
+            Why the attempt cannot be accepted; None if it is.
         """
         session, name = self._session, self._current
         self.end()
@@ -99,11 +105,11 @@ class AttemptRecordings:
                 Attempt(step, path, accepted.first_counter, accepted.last_counter, accepted.samples)
             )
         except InputError as error:
-            return str(error)
+            return message("recording_unreadable", why=str(error))
         if missing:
-            return f"{missing}: this computer or its disk was too slow"
+            return message("recording_lacks", what=missing)
         with atomic_write(session.folder / f"{name}.npz") as archive:
             np.savez(archive, **{f.name: getattr(log, f.name) for f in fields(log)})
         session.record_file(f"{name}.npz")
         session.append(AcceptedStep(**vars(accepted), recording=path.name, temperature_degc=dict(degc)))
-        return ""
+        return None

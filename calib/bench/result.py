@@ -14,9 +14,10 @@ from calib.bench.entries import ResidualVelocity
 from calib.bench.state import Attempt, SessionState
 from calib.certificate import certificate
 from calib.detection.blocks import BLOCK_NS
+from calib.estimation.gains import velocity_gain
 from calib.estimation.joint import estimate_joint
-from calib.estimation.linear_system import velocity_gain
-from calib.estimation.runs import CaptureRuns, NavigationOptions, Priors, navigate_capture
+from calib.estimation.priors import certified_priors
+from calib.estimation.runs import CaptureRuns, NavigationOptions, navigate_capture
 from calib.identification import (
     CaptureSummary,
     IdentificationResult,
@@ -116,7 +117,8 @@ def identify(
     InputError
         A recording cannot be read or lacks its rotation, or `estimate_joint` refuses.
     """
-    priors, bare = Priors(), prior_calibration.calibration.without_size_effect().without_skew()
+    priors = certified_priors(prior_calibration.calibration)
+    bare = prior_calibration.calibration.without_size_effect().without_skew()
     sources = tuple(_summarise(procedure, attempt, bare, site) for attempt in attempts)
     result = estimate_joint([run for source in sources for run in source.rotations.runs], priors)
     limits = procedure.rotation_limits(procedure.steps[0])

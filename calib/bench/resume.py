@@ -1,6 +1,6 @@
 """Conditions for resuming a session, and the operator's consent."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -9,8 +9,9 @@ from rich.console import Console
 
 from calib.bench.entries import EmbeddedFile, Resumed
 from calib.bench.session import Session
-from calib.bench.state import RESULT
+from calib.bench.state import REPORT, RESULT
 from calib.bench.verify import faulty_files
+from calib.messages import Message, message, text
 from imudrv import profiles
 from imudrv.calibration import read_calibration_file
 from imudrv.errors import InputError
@@ -21,7 +22,7 @@ RESUME_KELVIN: Final = 5.0
 
 def check_files(session: Session) -> None:
     """Raise `InputError` if a file of the session is missing or damaged."""
-    if faults := faulty_files(session):
+    if faults := faulty_files(session, session.files.keys() - {REPORT}):  # the report is written anew
         raise InputError("\n  ".join([f"{session.folder}: cannot be resumed:", *faults]))
 
 
@@ -79,6 +80,12 @@ def require_same(
         )
 
 
+def steps_message(session: Session) -> Message:
+    """Return the accepted steps of a session."""
+    accepted = tuple(session.accepted)
+    return message("steps", ids=accepted) if accepted else message("none")
+
+
 def require_temperature(session: Session, degc: Mapping[str, float | None]) -> None:
     """Refuse to resume a session at another temperature than that of the accepted runs.
 
@@ -107,7 +114,9 @@ def require_temperature(session: Session, degc: Mapping[str, float | None]) -> N
             )
 
 
-def resume(session: Session, console: Console, redo: Sequence[str], *, asks: bool) -> None:
+def resume(
+    session: Session, console: Console, redo: Sequence[str], language: str, ask: Callable[[], bool] | None
+) -> None:
     """Report the progress of a session, ask whether to resume it, and withdraw the steps to be done again.
 
     Parameters
@@ -118,21 +127,26 @@ def resume(session: Session, console: Console, redo: Sequence[str], *, asks: boo
         Terminal of the operator.
     redo : sequence of str
         Steps to be done again.
-    asks : bool
-        The operator is asked; otherwise the session is resumed at once.
+    language : str
+        Language of the operator.
+    ask : callable or None
+        Waits for the operator's answer; None: the session is resumed at once.
 
     Raises
     ------
     InputError
         The operator declines, or a step does not exist.
     """
-    lines = [session.dropped] if session.dropped else []
-    accepted = ", ".join(session.accepted) or "none yet"
-    plan = session.plan
-    lines.append(f"session {session.folder} of unit {plan.unit}: accepted steps: {accepted}")
-    lines.append(f"port {plan.port}, active certificate {plan.certificate.path}")
+    plan, lines = session.plan, [session.dropped] if session.dropped else []
+    state = message("resume_state", folder=str(session.folder), unit=plan.unit, steps=steps_message(session))
+    port = message("resume_port", port=plan.port, certificate=str(plan.certificate.path))
+    lines += [text(state, language), text(port, language)]
     console.print("\n".join(lines), markup=False, soft_wrap=True)
-    if asks and console.input("resume it? [y/n] ", markup=False).strip().lower() not in ("y", "yes"):
-        raise InputError(f"{session.folder}: not resumed and not changed; name another folder to begin anew")
+    if ask is not None:
+        console.print(text(message("resume"), language), markup=False)
+        if not ask():
+            raise InputError(
+                f"{session.folder}: not resumed and not changed; name another folder to begin anew"
+            )
     session.redo(redo)
     session.append(Resumed(session.record_leftovers()))

@@ -1,8 +1,9 @@
 """`calib run`: a session from the command line, with a unit or a rehearsal."""
 
 import os
+import time
 from collections.abc import Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -10,28 +11,36 @@ from signal import SIGINT, SIGTERM
 from threading import Thread
 from typing import Final
 
+import numpy as np
 from rich.console import Console
 
+from calib.bench.completion import accepted_result
 from calib.bench.controller import SessionController
 from calib.bench.entries import EmbeddedFile
 from calib.bench.keys import Keyboard
 from calib.bench.queue_sink import QueueSink
-from calib.bench.resume import check_files, require_same, resume
+from calib.bench.resume import check_files, require_same, resume, steps_message
 from calib.bench.screen import OperatorScreen
 from calib.bench.session import Session
 from calib.bench.simulated_unit import SimulatedUnitProcess, is_rehearsal
 from calib.bench.state import JOURNAL, REPORT, RESULT, WORKING_CERTIFICATE
-from calib.bench.technician import BENCH
+from calib.bench.technician import BENCH, mistakes_of
+from calib.bench.web_console import WebConsole
 from calib.certificate import lever_arms_of
 from calib.inputs import require_six_axes
+from calib.messages import Message, language, message, text
 from calib.procedure import plan
 from calib.procedure.schema import Procedure
+from calib.reports.pdf import renderer, write_pdf
 from calib.reports.text import as_text
 from calib.reports.truth import comparison
+from calib.sensors import plan as sensors_plan
 from imudrv import profiles
+from imudrv.bench import BENCH_FILE, Bench
 from imudrv.calibration import coefficients, read_calibration
 from imudrv.errors import InputError
 from imudrv.files import settings_file
+from imudrv.files.config_folder import config_file
 from imudrv.imu.compensation import require_sensors
 from imudrv.service.endpoint import default_folder
 from imudrv.service.loop import Service
@@ -40,7 +49,7 @@ from imudrv.service.settings import Settings
 from imudrv.signals import SIGHUP
 from imudrv.sinks.history import History
 from imudrv.site import Site
-from imudrv.terminal import INTERRUPTED, OK
+from imudrv.terminal import INTERRUPTED, NOT_GOOD, OK
 from imudrv.units import MM
 
 PROCEDURE: Final = "three-rotations"
@@ -49,6 +58,9 @@ PROCEDURE: Final = "three-rotations"
 
 REHEARSAL_PROFILE: Final = "imu50-rs422"
 """Default profile of a rehearsal."""
+
+
+_LINGER_S: Final = 0.2
 
 
 QUEUE_LIMIT: Final = 1000
@@ -72,14 +84,30 @@ class RunOptions:
         Name or path; None: `PROCEDURE`.
     hands_free : bool
         Proceed by the sensors alone, without keys.
+    accept : bool
+        Accept the result without a person, unless a verdict is bad.
     rehearse : bool
         Use a simulated unit and technician, hands free.
+    keys : bool
+        A person presses the keys of the rehearsal, and the technician does what the screen says.
+    web : str or None
+        Address of a page for browsers, see `imudrv.web.server.PageServer`; its buttons are keys.
+    mistakes : str
+        Mistakes of the technician, see `calib.bench.technician.mistakes_of`.
     speed : str
         Speed of the rehearsal: a number, or ``max``.
+    pdf : bool
+        Write the report as PDF, too.
+    bench : Path or None
+        Bench file of a new session; None: that of the user's configuration, if there is one.
+    operator, unit : str or None
+        Who conducts a new session, and the serial number on the unit; asked at a terminal if not given.
     redo : sequence of str
         Steps of an existing session to do again.
     plan : bool
         Only show the procedure and its expected accuracy.
+    language : str or None
+        Language of the operator; None: that of the system.
     """
 
     folder: Path
@@ -89,10 +117,19 @@ class RunOptions:
     site: Path | None = None
     procedure: str | None = None
     hands_free: bool = False
+    accept: bool = False
     rehearse: bool = False
+    keys: bool = False
+    web: str | None = None
+    mistakes: str = ""
     speed: str = "1"
+    pdf: bool = False
+    bench: Path | None = None
+    operator: str | None = None
+    unit: str | None = None
     redo: Sequence[str] = ()
     plan: bool = False
+    language: str | None = None
 
     @property
     def is_rehearsal(self) -> bool:
@@ -102,7 +139,13 @@ class RunOptions:
     @property
     def has_operator(self) -> bool:
         """Whether an operator presses keys."""
-        return not (self.hands_free or self.is_rehearsal)
+        if self.hands_free:
+            return False
+        return not self.is_rehearsal or self.keys or self.web is not None
+
+    def say(self, console: Console, what: Message) -> None:
+        """Print a message in the language of the operator."""
+        console.print(text(what, language(self.language)), markup=False, highlight=False, soft_wrap=True)
 
 
 def new_folder() -> Path:
@@ -123,7 +166,8 @@ def run(options: RunOptions, console: Console) -> int:
     Returns
     -------
     int
-        Exit code: 0 at the session's end, 130 when it can be resumed.
+        Exit code: 0 at the session's end; 130 when it can be resumed; 3 when nobody was there to accept the
+        result.
 
     Raises
     ------
@@ -134,7 +178,17 @@ def run(options: RunOptions, console: Console) -> int:
         console.print(_plan_text(options), markup=False, highlight=False, soft_wrap=True)
         return OK
     with closing(open_or_create(options, console)) as session:
-        return conduct(session, options, console)
+        if options.web is None:
+            return conduct(session, options, console)
+        with closing(WebConsole(session, options.web, language(options.language))) as web:
+            options.say(console, message("web_address", url=web.url))
+            code = conduct(session, options, console, web)
+            if web.viewers:
+                options.say(console, message("web_stays"))
+                with suppress(KeyboardInterrupt):
+                    while web.viewers:
+                        time.sleep(_LINGER_S)
+            return code
 
 
 def open_or_create(options: RunOptions, console: Console) -> Session:
@@ -146,17 +200,27 @@ def open_or_create(options: RunOptions, console: Console) -> Session:
     session = Session.open(options.folder)
     try:
         _require_resumable(session, options)
-        resume(session, console, options.redo, asks=options.has_operator)
+        resume(
+            session,
+            console,
+            options.redo,
+            language(options.language),
+            _ask if options.has_operator and Keyboard().there else None,
+        )
     except BaseException:
         session.close()
         raise
     return session
 
 
-def conduct(session: Session, options: RunOptions, console: Console) -> int:
+def conduct(session: Session, options: RunOptions, console: Console, web: WebConsole | None = None) -> int:
     """Conduct an open session: the service runs in this thread, the controller in another; see `run`."""
     begun_with = session.plan
-    simulated = SimulatedUnitProcess(session.folder, options.speed) if options.is_rehearsal else None
+    simulated = None
+    if options.is_rehearsal:
+        simulated = SimulatedUnitProcess(
+            session.folder, options.speed, options.mistakes, is_live=options.has_operator
+        )
     queue = QueueSink(QUEUE_LIMIT if simulated is not None and simulated.waits else None)
     profile = session.profile()
     layout = profiles.load(profile).layout()
@@ -186,10 +250,13 @@ def conduct(session: Session, options: RunOptions, console: Console) -> int:
         layout,
         service,
         queue,
-        OperatorScreen(console),
+        OperatorScreen(console, language(options.language)),
         Keyboard(),
         hands_free=not options.has_operator,
+        accepts=options.accept or (options.is_rehearsal and not options.has_operator),
         begin=begin,
+        watch=(lambda _: None) if simulated is None else simulated.watch,
+        web=web,
     )
     worker = Thread(target=controller.run, name="controller")
     # From here on: an interrupt while compiled code is loaded could be lost or leave a lock behind.
@@ -203,14 +270,22 @@ def conduct(session: Session, options: RunOptions, console: Console) -> int:
             if simulated is not None:
                 simulated.end()
             if not controller.outcome:
-                console.print(f"accepted steps: {', '.join(session.accepted) or 'none'}", markup=False)
-                resume_command = f"resume with: calib run --session {session.folder}"
-                console.print(resume_command, markup=False, soft_wrap=True)
+                for line in accepted_result(session):
+                    options.say(console, line)
+                options.say(console, message("accepted_steps", steps=steps_message(session)))
+                options.say(console, message("resume_with", folder=str(session.folder)))
     if controller.error is not None:
         raise controller.error
     if not controller.outcome:
-        return INTERRUPTED
-    console.print(controller.outcome, markup=False, highlight=False, soft_wrap=True)
+        return NOT_GOOD if controller.is_undecided else INTERRUPTED
+    for line in controller.outcome:
+        options.say(console, line)
+    if web is not None:
+        web.end(controller.outcome)
+    report = session.folder / REPORT
+    if options.pdf and REPORT in session.files:
+        write_pdf(report, report.with_suffix(".pdf"))
+        options.say(console, message("report", path=str(report.with_suffix(".pdf"))))
     if simulated is not None:
         result = session.folder / RESULT
         found = lever_arms_of(read_calibration(result), str(result))
@@ -219,15 +294,26 @@ def conduct(session: Session, options: RunOptions, console: Console) -> int:
     return OK
 
 
+def _ask() -> bool:
+    with Keyboard() as keys:
+        return keys.wait_for_answer()
+
+
 def _check(options: RunOptions, exists: bool) -> None:
     """Refuse options that do not fit together."""
     folder = options.folder
-    if options.has_operator and not Keyboard().there:
+    if options.has_operator and options.web is None and not Keyboard().there:
         raise InputError("expected a terminal for the operator's keys, got none; use one, or --hands-free")
     if options.is_rehearsal and (options.port or options.calibration or options.site):
         raise InputError("--rehearse: expected no --port, --calibration or --site; it has a unit of its own")
+    if (options.keys or options.mistakes) and not options.is_rehearsal:
+        raise InputError("--keys, --mistakes: expected with --rehearse")
+    if options.mistakes:
+        mistakes_of(options.mistakes, plan.load(options.procedure or PROCEDURE), np.random.default_rng())
     if exists and options.rehearse and not is_rehearsal(folder):
         raise InputError(f"{folder}: --rehearse: expected a rehearsal to resume, got the session of a unit")
+    if options.pdf:
+        renderer()
     if options.redo and not exists:
         raise InputError(f"--redo: expected an existing session, with --session, got none in {folder}")
 
@@ -237,13 +323,19 @@ def _plan_text(options: RunOptions) -> str:
     if options.site is None and not options.rehearse:
         raise InputError("--plan: expected --site, for the latitude, or --rehearse")
     site = BENCH if options.site is None else settings_file.read(options.site, Site)
-    return plan.text(plan.load(options.procedure or PROCEDURE), site)
+    procedure = plan.load(options.procedure or PROCEDURE)
+    return plan.text(procedure, site) if procedure.kind == "arms" else sensors_plan.text(procedure, site)
 
 
 def _create(options: RunOptions, console: Console) -> Session:
     """Create a session, and print the expected accuracy of its procedure."""
     folder, name = options.folder, options.procedure or PROCEDURE
     procedure = plan.load_file(name)
+    if procedure.model.kind != "arms":
+        raise InputError(
+            f"{name}: expected a procedure of kind arms, got one of kind {procedure.model.kind}; record all "
+            f"of it with imudrv run --record, then use calib {procedure.model.kind}"
+        )
     port, calibration, site, profile = options.port, options.calibration, options.site, options.profile
     if options.is_rehearsal:
         profile = profile or REHEARSAL_PROFILE
@@ -257,13 +349,12 @@ def _create(options: RunOptions, console: Console) -> Session:
         raise incomplete
     require_sensors(coefficients(read_calibration(calibration)), layout)
     place = settings_file.read_file(site, Site)
+    bench_path = _bench_path(options)
+    bench = None if bench_path is None else settings_file.read_file(bench_path, Bench)
+    operator = _operator(options, console, read_calibration(calibration).serial_number, bench)
     worst_mm = float(plan.predicted(procedure.model, place.model).differences_sigma.max()) / MM
     minutes = plan.duration_s(procedure.model) / 60.0
-    expected = (
-        f"session {folder}: about {minutes:.0f} min, expected accuracy of the differences: "
-        f"{worst_mm:.3f} mm (1 sigma)"
-    )
-    console.print(expected, markup=False, soft_wrap=True)
+    options.say(console, message("expected", folder=str(folder), minutes=minutes, worst_mm=worst_mm))
     return Session.create(
         folder,
         procedure=EmbeddedFile.of(name, procedure.content),
@@ -271,7 +362,34 @@ def _create(options: RunOptions, console: Console) -> Session:
         site=EmbeddedFile.of(site, place.content),
         profile=profile,
         port=port,
+        bench=None if bench is None else EmbeddedFile.of(str(bench_path), bench.content),
+        operator=operator,
     )
+
+
+def _bench_path(options: RunOptions) -> Path | None:
+    """Return the bench file, if there is one."""
+    if options.bench is not None:
+        return options.bench
+    default = config_file(BENCH_FILE)
+    return default if default is not None and default.is_file() else None
+
+
+def _operator(
+    options: RunOptions, console: Console, unit: str, bench: settings_file.SettingsFile[Bench] | None
+) -> str:
+    """Return the operator; refuse another unit than that of the certificate; ask for what is not given."""
+    asks = options.has_operator and not options.is_rehearsal and Keyboard().there
+    serial, operator = options.unit, options.operator
+    if serial is None and asks:
+        options.say(console, message("ask_unit"))
+        serial = console.input().strip()  # a scanner types, too
+    if serial is not None and serial != unit:
+        raise InputError(f"expected unit {unit!r} of the certificate, got {serial!r}; connect that unit")
+    if operator is None and asks:
+        options.say(console, message("ask_operator"))
+        operator = console.input().strip()
+    return operator or ("" if bench is None else bench.model.operator)
 
 
 def _require_resumable(session: Session, options: RunOptions) -> None:

@@ -1,13 +1,14 @@
 """Operator's screen: the current instruction, readable from two metres; a function of the engine's `View`.
 
-On a terminal the screen is redrawn in place; elsewhere (a pipe, ``TERM=dumb``) each change is a line.
+On a terminal the screen is redrawn in place; elsewhere (a pipe, ``TERM=dumb``) each change is a line. The
+large letters are English in every language; in another one the headline is repeated below them.
 """
 
-import textwrap
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
+from math import ceil
 from typing import Final
 
 from rich.console import Console, Group, RenderableType
@@ -17,7 +18,7 @@ from rich.text import Text
 
 from calib.bench import block_letters
 from calib.bench.keys import BY_LINES
-from calib.messages import english, message, verbatim
+from calib.messages import Message, message, text
 from calib.procedure.events import Phase, View
 from imudrv.diagnosis import LineState
 
@@ -37,6 +38,10 @@ _OTHER_ROWS: Final = 8
 """Rows besides headline, hints and reasons; one stays free for terminals that scroll after the last row."""
 
 
+_FIGURES: Final = 5
+"""Rows of the bars."""
+
+
 _FEWEST: Final = 2
 
 
@@ -47,19 +52,62 @@ _MOST_REASONS: Final = 5
 """Limits on the rows of hints and reasons, so that the headline keeps its space."""
 
 
-_NAMES: Final = {"confirm": "Enter", "redo": "r", "skip": "s", "abort": "q"}
+_NAMES: Final = {
+    "confirm": ("Enter", message("key_confirm")),
+    "redo": ("r", message("key_redo")),
+    "skip": ("s", message("key_skip")),
+    "back": ("b", message("key_back")),
+    "abort": ("q", message("key_abort")),
+}
+"""Key and name of each action."""
+
+
+PHASES: Final = {
+    Phase.PREFLIGHT: message("phase_preflight"),
+    Phase.PLACE: message("phase_place"),
+    Phase.SETTLE: message("phase_settle"),
+    Phase.ALIGN: message("phase_align"),
+    Phase.ROTATE: message("phase_rotate"),
+    Phase.REST: message("phase_rest"),
+    Phase.VERDICT: message("phase_verdict"),
+    Phase.DONE: message("phase_done"),
+    Phase.ABORTED: message("phase_aborted"),
+}
+"""Name of each phase."""
+
+
+_LINE_STATES: Final = {
+    "connecting": message("line_connecting"),
+    "silent": message("line_silent"),
+    "unreadable": message("line_unreadable"),
+    "wrong rate": message("line_wrong_rate"),
+    "lost": message("line_lost"),
+    "ended": message("line_ended"),
+}
+
+
+_WRAPS: Final = Console(color_system=None)
+
+
+_TONES: Final = {
+    Phase.PREFLIGHT: "do",
+    Phase.PLACE: "do",
+    Phase.SETTLE: "wait",
+    Phase.ALIGN: "wait",
+    Phase.ROTATE: "turn",
+    Phase.REST: "wait",
+    Phase.VERDICT: "good",
+    Phase.DONE: "good",
+    Phase.ABORTED: "bad",
+}
 
 
 _STYLES: Final = {
-    Phase.PREFLIGHT: "white on blue",
-    Phase.PLACE: "white on blue",
-    Phase.SETTLE: "black on yellow",
-    Phase.ALIGN: "black on yellow",
-    Phase.ROTATE: "white on magenta",
-    Phase.REST: "black on yellow",
-    Phase.VERDICT: "black on green",
-    Phase.DONE: "black on green",
-    Phase.ABORTED: "white on red",
+    "do": "white on blue",
+    "wait": "black on yellow",
+    "turn": "white on magenta",
+    "good": "black on green",
+    "bad": "white on red",
 }
 
 
@@ -82,11 +130,17 @@ def with_port_state(view: View, state: LineState) -> View:
         return view
     headlines = {"unreadable": NO_FRAMES, "wrong rate": WRONG_RATE}
     headline = headlines.get(state.name, NO_DATA)
-    return replace(view, headline=headline, reasons=(verbatim(str(state)), *view.reasons))
+    reason = message("line", state=_LINE_STATES[state.name], trouble=state.trouble)
+    return replace(view, headline=headline, reasons=(reason, *view.reasons))
 
 
 def screen(
-    view: View, width: int, height: int, question: str = "", ascii_only: bool = False
+    view: View,
+    width: int,
+    height: int,
+    question: Message | None = None,
+    ascii_only: bool = False,
+    language: str = "en",
 ) -> RenderableType:
     """Draw a view; it fits 80 columns and 24 lines.
 
@@ -96,37 +150,55 @@ def screen(
         View of the engine.
     width, height : int
         Size of the terminal, cells.
-    question : str
+    question : Message, optional
         Question to show instead of the keys.
     ascii_only : bool
         The terminal has no block characters.
+    language : str
+        Language of all but the large letters.
 
     Returns
     -------
     renderable
     """
+
+    def shown(what: Message) -> str:
+        return text(what, language)
+
     top = Table.grid(expand=True)
     top.add_column(no_wrap=True, overflow="ellipsis")
     top.add_column(justify="right", no_wrap=True)
-    where = f"{view.phase.value.upper()} {_time(view.remaining_s)}"
-    top.add_row(Text(english(view.title), "bold"), Text(where, "bold"))
-    hints = _wrapped([english(hint) for hint in view.hints], width, _FEWEST, _MOST_HINTS)
-    reasons = _wrapped([english(reason) for reason in view.reasons], width, _FEWEST, _MOST_REASONS)
-    free = height - _OTHER_ROWS - len(hints) - len(reasons)
+    top.add_row(Text(shown(view.title), "bold"), Text(shown(PHASES[view.phase]).upper(), "bold"))
+    headline = () if language == "en" else (view.headline,)
+    hints = _wrapped([*map(shown, (*headline, *view.hints))], width, _FEWEST, _MOST_HINTS)
+    reasons = _wrapped([*map(shown, shown_reasons(view))], width, _FEWEST, _MOST_REASONS)
+    last_try = _wrapped([shown(tried) for tried in shown_last_try(view)], width, 0, 1)
+    last = _keys(view.actions, language) if question is None else shown(question)
+    figures = () if _is_rejected(view) else (_figures(view, width, ascii_only, language),)
+    free = height - _OTHER_ROWS + _FIGURES * (not figures) - len(hints) - len(reasons) - len(last_try)
     return Group(
         top,
         _banner(view, width, max(1, free), ascii_only),
         Text("\n".join(hints)),
-        _figures(view, width, ascii_only),
+        *figures,
         Text("\n".join(reasons), "bold red"),
-        Text((question or _keys(view.actions))[:width], "bold red" if question else "dim"),
+        *(Text(row, "dim") for row in last_try),
+        Text(last, "dim" if question is None else "bold red", no_wrap=True, overflow="crop"),
     )
 
 
-def plain(view: View, question: str = "") -> str:
+def plain(view: View, question: Message | None = None, language: str = "en") -> str:
     """Return a view as one line, without the values that change continuously."""
-    parts = [english(view.title), f"{view.phase.value}: {english(view.headline)}", *map(english, view.hints)]
-    parts += [f"! {reason}" for reason in (*map(english, view.reasons), question) if reason]
+
+    def shown(what: Message) -> str:
+        return text(what, language)
+
+    phase = f"{shown(PHASES[view.phase])}: {shown(view.headline)}"
+    parts = [shown(view.title), phase, *map(shown, view.hints)]
+    parts += [f"! {shown(why)}" for why in shown_reasons(view)] + [
+        shown(tried) for tried in shown_last_try(view)
+    ]
+    parts += [] if question is None else [f"! {shown(question)}"]
     return " | ".join(part for part in parts if part)
 
 
@@ -140,6 +212,8 @@ class OperatorScreen:
     ----------
     console : Console
         Console of rich. Without a terminal, or on a dumb one, it receives plain lines.
+    language : str
+        Language of the operator; English where the terminal can show only ASCII.
 
     Attributes
     ----------
@@ -147,9 +221,10 @@ class OperatorScreen:
         Newest view that has been written: the operator's keys refer to it.
     """
 
-    def __init__(self, console: Console) -> None:
+    def __init__(self, console: Console, language: str = "en") -> None:
         self.shown: View | None = None
         self._console = console
+        self._language = "en" if console.options.ascii_only else language
         self._is_plain = not console.is_terminal or console.is_dumb_terminal
         self._live: Live | None = None
         self._bells = 0
@@ -157,21 +232,21 @@ class OperatorScreen:
         self._writer = ThreadPoolExecutor(1, "screen")
         self._newest: Future[None] | None = None
         self._newest_view: Future[None] | None = None
-        self._newest_text = ""
+        self._newest_line = ""
 
     @property
     def is_idle(self) -> bool:
         """Whether everything has been written."""
         return self._newest is None or self._newest.done()
 
-    def show(self, view: View, question: str = "") -> None:
+    def show(self, view: View, question: Message | None = None) -> None:
         """Show a view.
 
         Parameters
         ----------
         view : View
             View of the engine.
-        question : str
+        question : Message, optional
             Question to show instead of the keys.
 
         Raises
@@ -179,15 +254,19 @@ class OperatorScreen:
         OSError
             The terminal can no longer be written to.
         """
-        text = plain(view, question) if self._is_plain else ""
-        if self._newest_view is not None and text == self._newest_text:
+        line = plain(view, question, self._language) if self._is_plain else ""
+        if self._newest_view is not None and line == self._newest_line:
             self._newest_view.cancel()
-        self._newest_text = text
+        self._newest_line = line
         self._newest_view = self._submit(partial(self._draw, view, question))
 
     def print(self, what: RenderableType) -> None:
         """Leave the full-screen view and print permanent text."""
         self._submit(partial(self._print, what))
+
+    def say(self, what: Message) -> None:
+        """Print a message as permanent text."""
+        self.print(text(what, self._language))
 
     def close(self) -> None:
         """Write everything that waits, however long the terminal takes, and restore the terminal."""
@@ -203,9 +282,9 @@ class OperatorScreen:
 
     # Methods of the writing thread
 
-    def _draw(self, view: View, question: str) -> None:
+    def _draw(self, view: View, question: Message | None) -> None:
         if self._is_plain:
-            self._print_line(plain(view, question))
+            self._print_line(plain(view, question, self._language))
         else:
             if view.bells > self._bells:
                 self._console.bell()
@@ -215,14 +294,15 @@ class OperatorScreen:
                 self._live.start()
             size = self._console.size
             ascii_only = self._console.options.ascii_only
-            self._live.update(screen(view, size.width, size.height, question, ascii_only), refresh=True)
+            drawn = screen(view, size.width, size.height, question, ascii_only, self._language)
+            self._live.update(drawn, refresh=True)
         self.shown = view
 
-    def _print_line(self, text: str) -> None:
+    def _print_line(self, line: str) -> None:
         """Print a line unless it repeats the last one."""
-        if text != self._last:
-            self._console.print(text, markup=False, highlight=False, soft_wrap=True)
-            self._last = text
+        if line != self._last:
+            self._console.print(line, markup=False, highlight=False, soft_wrap=True)
+            self._last = line
 
     def _print(self, what: RenderableType) -> None:
         self._leave()
@@ -234,18 +314,41 @@ class OperatorScreen:
             self._live = None
 
 
-def _time(seconds: float | None) -> str:
-    return "" if seconds is None else f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
+def tone(view: View) -> str:
+    """Return what a view asks for: 'do', 'wait', 'turn'; or how something went: 'good', 'bad'."""
+    refused = view.reasons and view.phase in (Phase.PREFLIGHT, Phase.VERDICT)
+    if refused or view.headline in (NO_DATA, NO_FRAMES, WRONG_RATE):
+        return "bad"
+    return "wait" if view.headline.key == "hands_off" else _TONES[view.phase]
+
+
+def large_text(view: View, language: str = "en") -> str:
+    """Return the headline, with the remaining time where one has to wait."""
+    headline, remaining_s = text(view.headline, language), view.remaining_s
+    if view.headline.key != "hands_off" or remaining_s is None:
+        return headline
+    minutes, seconds = divmod(ceil(remaining_s), 60)
+    return f"{headline} {minutes}:{seconds:02d}"
+
+
+def _is_rejected(view: View) -> bool:
+    """Whether the view shows a rejected attempt."""
+    return view.headline.key == "rejected"
+
+
+def shown_reasons(view: View) -> tuple[Message, ...]:
+    """Return the reasons to show: of a rejection one, which its hint remedies."""
+    return view.reasons[:1] if _is_rejected(view) else view.reasons
+
+
+def shown_last_try(view: View) -> tuple[Message, ...]:
+    """Return why the last attempt was rejected."""
+    return tuple(message("label_last_try", reason=reason) for reason in view.last_try[:1])
 
 
 def _banner(view: View, width: int, height: int, ascii_only: bool) -> RenderableType:
-    refused = view.reasons and view.phase in (Phase.PREFLIGHT, Phase.PLACE, Phase.VERDICT)
-    style = (
-        "white on red"
-        if refused or view.headline in (NO_DATA, NO_FRAMES, WRONG_RATE)
-        else _STYLES[view.phase]
-    )
-    headline, inside = english(view.headline), width - 2
+    style = _STYLES[tone(view)]
+    headline, inside = large_text(view), width - 2
     scale, lines = block_letters.fitted(headline, inside, height)
     if ascii_only and scale < 2:
         scale = 0
@@ -256,46 +359,64 @@ def _banner(view: View, width: int, height: int, ascii_only: bool) -> Renderable
         rows = [headline]
     free = height - len(rows)
     rows = ["" for _ in range(free // 2)] + rows + ["" for _ in range(free - free // 2)]
-    text = "\n".join(row.center(width)[:width] for row in rows)
-    return Text(text, f"bold {style}", no_wrap=True, overflow="crop")
+    drawn_text = "\n".join(row.center(width)[:width] for row in rows)
+    return Text(drawn_text, f"bold {style}", no_wrap=True, overflow="crop")
 
 
 def _wrapped(texts: Sequence[str], width: int, fewest: int, most: int) -> list[str]:
     """Wrap texts into rows, each text on a new row; an ellipsis stands for rows beyond the limit."""
-    rows = [row for text in texts for row in textwrap.wrap(text, width)]
+    rows = [row.plain for one in texts for row in Text(one).wrap(_WRAPS, width)]
     if len(rows) > most:
-        rows = [*rows[: most - 1], textwrap.shorten(" ".join(rows[most - 1 :]), width, placeholder=" ...")]
+        rows = rows[:most]
+        rows[-1] = f"{_cut(rows[-1], width - 4)} ..."
     return rows + [""] * (fewest - len(rows))
 
 
-def _figures(view: View, width: int, ascii_only: bool) -> RenderableType:
+def _cut(line: str, width: int) -> str:
+    """Cut a line to a width in cells."""
+    cut = Text(line)
+    cut.truncate(width)
+    return cut.plain.rstrip()
+
+
+def _figures(view: View, width: int, ascii_only: bool, language: str) -> RenderableType:
     """Return the bars of angle, rate, stillness and progress, and the sigmas."""
+
+    def shown(what: Message) -> str:
+        return text(what, language)
+
     room = width - 10 - 24
-    full = view.want_deg or 180.0
-    angle = "" if view.angle_deg is None else f"{view.angle_deg:+.1f} of {full:+.0f} deg"
+    full, rate = view.want_deg or 180.0, abs(view.rate_deg_per_s)
+    angle = message("angle_of", angle_deg=view.angle_deg or 0.0, want_deg=full)
+    is_still = view.stillness > 0.8
     table = Table.grid(padding=(0, 1))
     table.add_column(width=9, style="bold")
     table.add_column(width=room, no_wrap=True)
     table.add_column(no_wrap=True, overflow="ellipsis")
 
-    def add(name: str, part: float | None, style: str, text: str) -> None:
-        table.add_row(name, _bar(part, room, style, ascii_only), text)
+    def add(name: Message, part: float | None, style: str, value: str) -> None:
+        table.add_row(shown(name), _bar(part, room, style, ascii_only), value)
 
-    add("angle", (view.angle_deg or 0.0) / full, "magenta", angle)
-    add("rate", abs(view.rate_deg_per_s) / 150.0, "cyan", f"{abs(view.rate_deg_per_s):.0f} deg/s")
     add(
-        "still",
-        view.stillness,
-        "green" if view.stillness > 0.8 else "red",
-        "" if view.stillness > 0.8 else "moving",
+        message("label_angle"),
+        (view.angle_deg or 0.0) / full,
+        "magenta",
+        "" if view.angle_deg is None else shown(angle),
     )
-    add("progress", view.progress, "yellow", "" if view.progress is None else f"{view.progress:.0%}")
-    sigmas = [
-        f"{name} {sigma:.4f} deg"
-        for name, sigma in (("level", view.level_sigma_deg), ("heading", view.heading_sigma_deg))
-        if sigma is not None
-    ]
-    table.add_row("1 sigma", ", ".join(sigmas), "")
+    add(message("label_rate"), rate / 150.0, "cyan", shown(message("rate_value", rate_deg_per_s=rate)))
+    add(
+        message("label_still"),
+        view.stillness,
+        "green" if is_still else "red",
+        "" if is_still else shown(message("label_moving")),
+    )
+    percent = "" if view.progress is None else f"{view.progress:.0%}"
+    add(message("label_progress"), view.progress, "yellow", percent)
+    level, heading = view.level_sigma_deg, view.heading_sigma_deg
+    sigmas = ""
+    if level is not None and heading is not None:
+        sigmas = shown(message("sigmas", level_deg=level, heading_deg=heading))
+    table.add_row(shown(message("label_sigma")), sigmas, "")
     return table
 
 
@@ -305,6 +426,6 @@ def _bar(part: float | None, width: int, style: str, ascii_only: bool) -> Text:
     return Text.assemble((full * filled, style), (empty * (width - filled), "dim"))
 
 
-def _keys(actions: Sequence[str]) -> str:
-    names = [f"{_NAMES[name]}: {name}" for name in _NAMES if name in actions]
-    return "   ".join([*names, "(a letter, then Enter)"] if names and BY_LINES else names)
+def _keys(actions: Sequence[str], language: str) -> str:
+    names = [f"{key}: {text(name, language)}" for action, (key, name) in _NAMES.items() if action in actions]
+    return "   ".join([*names, text(message("key_by_lines"), language)] if names and BY_LINES else names)

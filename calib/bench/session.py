@@ -17,6 +17,7 @@ end of the journal.
 
 import hashlib
 import os
+import platform
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -86,6 +87,8 @@ class Session(SessionState):
         site: EmbeddedFile,
         profile: str,
         port: str,
+        bench: EmbeddedFile | None = None,
+        operator: str = "",
     ) -> Self:
         """Create a session in a new folder.
 
@@ -101,6 +104,10 @@ class Session(SessionState):
             Name or path of the profile.
         port : str
             Port of the unit.
+        bench : EmbeddedFile, optional
+            Who calibrates, where and with what; already checked.
+        operator : str
+            Who conducts the session.
 
         Returns
         -------
@@ -123,6 +130,9 @@ class Session(SessionState):
             procedure=procedure,
             site=site,
             profile=EmbeddedFile.of(profile, profiles.content(profile)),
+            bench=bench,
+            operator=operator,
+            host=platform.node()[:64],
         )
         try:
             folder.mkdir(parents=True, exist_ok=True)

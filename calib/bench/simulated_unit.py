@@ -3,21 +3,34 @@
 import socket
 import subprocess
 import sys
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from threading import Timer
 from typing import Final
 
-from calib.bench.technician import BENCH, technician_scenario, true_calibration
+import numpy as np
+
+from calib.bench.technician import (
+    BENCH,
+    LiveTechnician,
+    Mistake,
+    mistakes_of,
+    technician_scenario,
+    true_calibration,
+    unit_scenario,
+)
 from calib.certificate import lever_arms_of
 from calib.lever_arms.gauge import LeverArms
-from calib.procedure.schema import Procedure
+from calib.procedure.events import View
+from calib.procedure.schema import VERIFICATION, Procedure
 from imudrv import profiles
 from imudrv.calibration import write_calibration
 from imudrv.errors import InputError
 from imudrv.files import settings_file
 from imudrv.loopback import LOOPBACK
 from imudrv.posix import termios
-from imudrv.sim.scenario import nominal
+from imudrv.sim.scenario import Segment, nominal
 from imudrv.url import speed_of
 from imudrv.wire.layout import Layout
 
@@ -58,6 +71,10 @@ class SimulatedUnitProcess:
         Folder of the session.
     speed : str
         Seconds of the rehearsal per second, or ``max``: as fast as the engine accepts samples.
+    mistakes : str
+        What the technician does wrong, see `mistakes_of`; empty: nothing.
+    is_live : bool
+        The technician follows the screen, while a person presses the keys; otherwise the time.
 
     Raises
     ------
@@ -70,10 +87,14 @@ class SimulatedUnitProcess:
         Port of the unit, for the driver.
     """
 
-    def __init__(self, folder: Path, speed: str) -> None:
+    def __init__(self, folder: Path, speed: str, mistakes: str = "", is_live: bool = False) -> None:
+        self._mistakes, self._is_live = mistakes, is_live
+        self._technician: LiveTechnician | None = None
         self._folder = folder / _FOLDER
         self._speed = speed
         self.waits = speed_of(speed) is None
+        if is_live and self.waits:
+            raise InputError("--speed max: expected a number, as a person presses the keys")
         self._unit: subprocess.Popen[str] | None = None
         if termios is not None:
             self.port, self._target = str(self._link), ["--port", "pty", "--link", str(self._link)]
@@ -127,10 +148,22 @@ class SimulatedUnitProcess:
         self.end()
         scenario = self._folder / "scenario.yaml"
         sends = nominal(profiles.load(profile).layout())
-        settings_file.write(scenario, technician_scenario(procedure, seed=SEED, unit=sends))
-        command = ["sim", str(scenario), "--profile", profile, *self._target, "--speed", self._speed]
+        mistakes: tuple[Mistake, ...] = ()
+        if self._mistakes and procedure.steps[0].id != VERIFICATION:
+            mistakes = mistakes_of(self._mistakes, procedure, np.random.default_rng())
+        if self._is_live:
+            self._technician = technician = LiveTechnician(procedure, mistakes, SEED, self._move)
+            truth = true_calibration(SEED, sends)
+            scene = unit_scenario(technician.start, technician.begins_with, truth, SEED)
+            port, link = (self._target[1], self._target[3]) if termios is not None else (self._target[1], "")
+            command = ["-m", "calib.bench.live_unit", str(scenario), profile, port, link, self._speed]
+        else:
+            scene = technician_scenario(procedure, mistakes, seed=SEED, unit=sends)
+            sim = ["sim", str(scenario), "--profile", profile, *self._target, "--speed", self._speed]
+            command = ["-c", _UNIT, *sim]
+        settings_file.write(scenario, scene)
         self._unit = unit = subprocess.Popen(
-            [sys.executable, "-c", _UNIT, *command],
+            [sys.executable, *command],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -143,6 +176,18 @@ class SimulatedUnitProcess:
         if not is_there:
             _, reason = unit.communicate()
             raise InputError(f"the simulated unit did not start: {reason.strip()}")
+
+    def watch(self, view: View) -> None:
+        """Let the technician look at the screen."""
+        if self._technician is not None:
+            self._technician.watch(view)
+
+    def _move(self, motions: Sequence[Segment]) -> None:
+        if self._unit is not None and self._unit.stdin is not None:
+            with suppress(OSError):  # it has ended; the service says so
+                for motion in motions:
+                    self._unit.stdin.write(f"{motion.model_dump_json(exclude_none=True)}\n")
+                self._unit.stdin.flush()
 
     def end(self) -> None:
         """End the unit's process."""

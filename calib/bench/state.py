@@ -19,6 +19,7 @@ from calib.identification import PriorCalibration
 from calib.procedure.events import Finished, Redone
 from calib.procedure.plan import verification
 from calib.procedure.schema import VERIFICATION, Procedure, Step
+from imudrv.bench import Bench
 from imudrv.calibration import read_calibration
 from imudrv.errors import InputError
 from imudrv.files import settings_file
@@ -45,6 +46,10 @@ PROFILE: Final = "profile.yaml"
 
 
 LOCK: Final = ".lock"
+
+
+WEB_TOKEN: Final = ".web-token"
+"""Secret part of the address of the session's page."""
 
 
 Stage = TypeVar("Stage", Finished, Decision, SessionEnded)
@@ -101,6 +106,7 @@ class SessionState:
         self._procedure = self._parse("procedure", plan.procedure, Procedure)
         self._site = self._parse("site", plan.site, Site)
         self._parse("profile", plan.profile, Profile)
+        self._bench = Bench() if plan.bench is None else self._parse("bench", plan.bench, Bench)
 
     @property
     def files(self) -> dict[str, str]:
@@ -153,6 +159,10 @@ class SessionState:
     def procedure(self) -> Procedure:
         """Return the procedure of the session."""
         return self._procedure
+
+    def bench(self) -> Bench:
+        """Return who calibrates, where and with what."""
+        return self._bench
 
     def path(self, name: str) -> Path:
         """Return the path of a file of the session.

@@ -6,7 +6,7 @@ technician follows the engine's instructions and repeats the step. Times are tho
 `hands_free`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import radians
 from typing import Final, Literal
@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation as Attitude
 
 from calib.axes import side
 from calib.certificate import sensing_points
+from calib.procedure.events import Phase, View
 from calib.procedure.plan import turn_s
 from calib.procedure.preflight import PREFLIGHT_S
 from calib.procedure.prompts import READY_S
@@ -60,8 +61,21 @@ CARRY_DEG_PER_S: Final = 45.0
 """Mean rate while the unit is carried into another pose."""
 
 
+_MOVING: Final = 0.5  # stillness of a unit that moves
+
+
+_REACTION_VIEWS: Final = 8  # views at rest before the technician acts
+
+
+_MISSED_VIEWS: Final = 25  # views after which a motion that was not noticed is over
+
+
 ARM_MM: Final = 18.0
 """Distance of the random sensing points from their centroid along each axis, 1 sigma."""
+
+
+MISTAKES: Final[tuple[Kind, ...]] = ("moves", "wrong way", "short", "slow", "wrong pose", "bump")
+"""Mistakes to practise with, whoever makes them."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +98,40 @@ class Mistake:
     step_id: str
     kind: Kind
     turn: int = 1
+
+
+def mistakes_of(text: str, procedure: Procedure, rng: np.random.Generator) -> tuple[Mistake, ...]:
+    """Return the mistakes that a user names, in the first steps of a procedure.
+
+    Parameters
+    ----------
+    text : str
+        Such as ``wrong-way,slow``; or ``random``, for a random one in most steps.
+    procedure : Procedure
+        The procedure.
+    rng : Generator
+        For ``random``.
+
+    Returns
+    -------
+    tuple of Mistake
+
+    Raises
+    ------
+    InputError
+        A mistake is unknown, or there are more than steps.
+    """
+    steps = [step.id for step in procedure.steps]
+    if text == "random":
+        kinds = [MISTAKES[k] for k in rng.integers(len(MISTAKES), size=len(steps))]
+        return tuple(Mistake(s, kind) for s, kind in zip(steps, kinds, strict=True) if rng.random() < 0.75)
+    names = text.split(",")
+    known = {kind.replace(" ", "-"): kind for kind in MISTAKES}
+    if unknown := [name for name in names if name not in known]:
+        raise InputError(f"--mistakes: expected random, or some of {', '.join(known)}, got {unknown[0]!r}")
+    if len(names) > len(steps):
+        raise InputError(f"--mistakes: expected one a step, {len(steps)} at most, got {len(names)}")
+    return tuple(Mistake(step_id, known[name]) for step_id, name in zip(steps, names, strict=False))
 
 
 def technician_scenario(
@@ -132,13 +180,20 @@ def technician_scenario(
     for step in procedure.steps:
         hands.do(step, by_step.get(step.id))
     hands.rest(REACTION_S)
+    return unit_scenario(hands.start, hands.motion, truth, seed, hands.unplugs)
+
+
+def unit_scenario(
+    start: Start, motion: Sequence[Segment], truth: Calibration, seed: int, unplugs: Sequence[Unplug] = ()
+) -> Scenario:
+    """Return the scenario of a unit of typical errors with some motion."""
     return Scenario(
         format="imu50-scenario",
         version=1,
         seed=seed,
         site=BENCH,
-        start=hands.start,
-        motion=tuple(hands.motion),
+        start=start,
+        motion=tuple(motion),
         unit=Unit(
             calibration=truth,
             residuals=Residuals(
@@ -151,7 +206,7 @@ def technician_scenario(
             ),
             noise=Noise(arw_deg_per_sqrt_h=0.002, vrw_m_s_per_sqrt_h=0.003),
         ),
-        faults=Faults(unplugs=tuple(hands.unplugs)),
+        faults=Faults(unplugs=tuple(unplugs)),
     )
 
 
@@ -176,26 +231,26 @@ class _MotionScript:
         self.motion: list[Segment] = []
         self.unplugs: list[Unplug] = []
         self._t_s = 0.0
-        first = self._pose(procedure.steps[0])
+        first = self.pose(procedure.steps[0])
         self.start = _start(procedure.steps[0], first)
         self._C_nb = start_attitude(self.start)
         if procedure.steps[0].up[0] == "-":
-            self._carry(first)
+            self.carry(first)
         self.rest(PREFLIGHT_S + REACTION_S)
 
     def do(self, step: Step, made: Mistake | None) -> None:
         """Carry out a step, with a mistake."""
-        turn_deg, turn_s = self._by_hand(step.turn_deg)
+        turn_deg, turn_s = self.by_hand(step.turn_deg)
         mistake = made.kind if made else None
         if mistake == "wrong pose":
-            self._carry(self._wrong_pose(step))
+            self.carry(self.wrong_pose(step))
             self.rest(2.0 * REACTION_S)
-        if not self._is_in_pose(step):
-            self._carry(self._pose(step))
+        if not self.is_in_pose(step):
+            self.carry(self.pose(step))
         before_s = READY_S + self._procedure.limits.still_s
         if mistake == "moves":
             self.rest(before_s + 0.6 * step.align_s)
-            self._turn(2.0, 1.0)
+            self.turn(2.0, 1.0)
         elif mistake == "unplug":
             self.rest(before_s + 0.5 * step.align_s)
             self.unplugs.append(Unplug(at_s=self._t_s, duration_s=3.0))
@@ -203,38 +258,43 @@ class _MotionScript:
         elif mistake is not None and mistake != "wrong pose" and step.turns == 1:
             self._align(step)
             first_deg, first_s = _mistaken(mistake, turn_deg, turn_s)
-            self._turn(first_deg, first_s)
+            self.turn(first_deg, first_s)
             self.rest(REACTION_S)
             if mistake == "bump":
-                self._turn(0.5, 0.2)
+                self.turn(0.5, 0.2)
                 self.rest(REACTION_S)
-            self._turn(-first_deg, 4.0)
+            self.turn(-first_deg, 4.0)
         self._align(step)
         if step.turns > 1:
             self._several_turns(step, made)
             return
-        self._turn(turn_deg, turn_s)
+        self.turn(turn_deg, turn_s)
         self.rest(step.rest_s + REACTION_S)
 
     def _several_turns(self, step: Step, made: Mistake | None) -> None:
         """Make the turns of a run, without repeating the one with the mistake."""
         for number in range(1, step.turns + 1):
-            turn_deg, turn_s = self._by_hand(step.angle_deg(number))
+            turn_deg, turn_s = self.by_hand(step.angle_deg(number))
             mistake = made.kind if made and made.turn == number else None
-            self._turn(*_mistaken(mistake, turn_deg, turn_s))
+            self.turn(*_mistaken(mistake, turn_deg, turn_s))
             if mistake == "short rest":
                 self.rest(0.5 * step.rest_s)
                 continue
             if mistake == "bump":
                 self.rest(0.5 * step.rest_s)
-                self._turn(0.5, 0.2)
+                self.turn(0.5, 0.2)
             self.rest(step.rest_s + TURN_REACTION_S)
         self.rest(REACTION_S)
 
-    def _by_hand(self, turn_deg: float) -> tuple[float, float]:
+    def by_hand(self, turn_deg: float) -> tuple[float, float]:
         """Return angle and duration of a turn as a hand makes it."""
         duration_s = turn_s(self._procedure) * self._rng.uniform(0.9, 1.1)
         return turn_deg + self._rng.uniform(-1.5, 1.5), duration_s
+
+    def take(self) -> tuple[Segment, ...]:
+        """Return the motions since the last call."""
+        taken, self.motion = tuple(self.motion), []
+        return taken
 
     def rest(self, duration_s: float) -> None:
         """Leave the unit alone."""
@@ -244,7 +304,7 @@ class _MotionScript:
         limits = self._procedure.limits
         self.rest(READY_S + limits.still_s + step.align_s + REACTION_S)
 
-    def _turn(self, angle_deg: float, duration_s: float) -> None:
+    def turn(self, angle_deg: float, duration_s: float) -> None:
         """Rotate about the vertical, within a hand's accuracy."""
         lean = self._rng.normal(0.0, 2.0, 2) * 1e-3
         axis = (float(lean[0]), float(lean[1]), 1.0)
@@ -255,7 +315,7 @@ class _MotionScript:
         self._add(Segment(rotate=rotate), duration_s)
         self._C_nb = rotation(axis_n, radians(angle_deg)) @ self._C_nb
 
-    def _carry(self, C_nb: Array) -> None:
+    def carry(self, C_nb: Array) -> None:
         """Lift the unit, rotate it, and set it down."""
         self._tremble()
         turn = Attitude.from_matrix(C_nb @ self._C_nb.T).as_rotvec()
@@ -278,22 +338,87 @@ class _MotionScript:
         self.motion.append(segment)
         self._t_s += duration_s
 
-    def _pose(self, step: Step) -> Array:
+    def pose(self, step: Step) -> Array:
         """Return the attitude in which a person sets the unit down for a step."""
         heading = rotation((0.0, 0.0, 1.0), radians(self._rng.uniform(-8.0, 8.0)))
         lean = Attitude.from_rotvec([*(self._rng.normal(0.0, 1e-3, 2)), 0.0]).as_matrix()
         C_nb: Array = lean @ heading @ step.C_bn.T
         return C_nb
 
-    def _wrong_pose(self, step: Step) -> Array:
+    def wrong_pose(self, step: Step) -> Array:
         """Return a pose with another side up: the one that should face north."""
-        C_nb: Array = rotation((1.0, 0.0, 0.0), radians(90.0)) @ self._pose(step)
+        C_nb: Array = rotation((1.0, 0.0, 0.0), radians(90.0)) @ self.pose(step)
         return C_nb
 
-    def _is_in_pose(self, step: Step) -> bool:
+    def is_in_pose(self, step: Step) -> bool:
         """Return whether the unit is in the pose of a step."""
         off = Attitude.from_matrix(self._C_nb @ step.C_bn)
         return bool(off.magnitude() < radians(20.0))
+
+
+class LiveTechnician:
+    """Technician who does what the screen says while a person presses the keys; each mistake is made once.
+
+    Parameters
+    ----------
+    procedure : Procedure
+        The steps.
+    mistakes : sequence of Mistake
+        At most one per step.
+    seed : int
+        Of the hands.
+    move : callable
+        Receives the motions.
+    """
+
+    def __init__(
+        self,
+        procedure: Procedure,
+        mistakes: Sequence[Mistake],
+        seed: int,
+        move: Callable[[Sequence[Segment]], None],
+    ) -> None:
+        self._hands = _MotionScript(procedure, np.random.default_rng(seed))
+        self.start = self._hands.start
+        self.begins_with = self._hands.take()
+        self._steps = {step.id: step for step in procedure.steps}
+        self._mistakes = {mistake.step_id: mistake.kind for mistake in mistakes}
+        self._move = move
+        self._is_moving, self._has_moved, self._still_views = False, False, 0
+
+    def watch(self, view: View) -> None:
+        """Look at the screen, and act once the unit rests."""
+        if view.stillness < _MOVING:
+            self._has_moved, self._still_views = True, 0
+            return
+        self._still_views += 1
+        is_done = self._has_moved or self._still_views >= _MISSED_VIEWS
+        if self._still_views < _REACTION_VIEWS or (self._is_moving and not is_done):
+            return
+        self._is_moving = self._has_moved = False
+        step = self._steps.get(view.step_id)
+        if step is not None:
+            self._act(step, view)
+        if motions := self._hands.take():
+            self._is_moving, self._still_views = True, 0
+            self._move(motions)
+
+    def _act(self, step: Step, view: View) -> None:
+        hands, mistake = self._hands, self._mistakes.get(step.id)
+        if view.phase is Phase.PLACE and not hands.is_in_pose(step):
+            wrong = mistake == "wrong pose" and self._mistakes.pop(step.id)
+            hands.carry(hands.wrong_pose(step) if wrong else hands.pose(step))
+        elif view.phase is Phase.ALIGN and mistake == "moves" and (view.progress or 0.0) > 0.3:
+            del self._mistakes[step.id]
+            hands.turn(2.0, 1.0)
+        elif view.phase is Phase.ROTATE and view.want_deg is not None:
+            turn = hands.by_hand(view.want_deg)
+            if mistake in ("wrong way", "short", "slow"):
+                turn = _mistaken(self._mistakes.pop(step.id), *turn)
+            hands.turn(*turn)
+        elif view.phase is Phase.REST and mistake == "bump":
+            del self._mistakes[step.id]
+            hands.turn(0.5, 0.2)
 
 
 def _mistaken(mistake: Kind | None, turn_deg: float, turn_s: float) -> tuple[float, float]:

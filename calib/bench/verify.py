@@ -4,7 +4,7 @@ Hashes detect accidents. Only a signature of a key that is trusted detects forge
 """
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,6 +19,7 @@ from calib.bench.state import (
     LOCK,
     PROFILE,
     RESULT,
+    WEB_TOKEN,
     WORKING_CERTIFICATE,
     SessionState,
     require_session,
@@ -93,10 +94,12 @@ def verify(path: Path, trusted: Mapping[str, str] | None = None) -> Verified:
     return _verify_certificate(path, trusted) if is_file else _verify_session(path, trusted)
 
 
-def faulty_files(session: SessionState) -> list[str]:
-    """Return the missing and damaged files of a session, one line each."""
+def faulty_files(session: SessionState, names: Collection[str]) -> list[str]:
+    """Return the missing and damaged files of some in the journal of a session, one line each."""
     faults = []
     for name, digest in session.files.items():
+        if name not in names:
+            continue
         try:
             path = session.path(name)
             found = atomic.sha256(path)
@@ -126,11 +129,17 @@ def _verify_session(folder: Path, trusted: Mapping[str, str] | None) -> Verified
     except InputError as error:
         return Verified((str(error),), ())
     files = session.files
-    faults = _signature_faults(folder, contents) + faulty_files(session)
+    faults = _signature_faults(folder, contents) + faulty_files(session, files)
     if not faults:
         faults = [*_disagreements(session), *_uncovered_steps(session)]
     notes = [f"{len(contents.entries)} lines and {len(files)} files checked"]
-    unknown = {path.name for path in folder.iterdir() if path.is_file()} - {*files, JOURNAL, LOCK, PROFILE}
+    unknown = {path.name for path in folder.iterdir() if path.is_file()} - {
+        *files,
+        JOURNAL,
+        LOCK,
+        PROFILE,
+        WEB_TOKEN,
+    }
     shown = (name if name.isprintable() else ascii(name) for name in sorted(unknown))
     notes += [f"{folder / name}: not in the journal, not checked" for name in shown]
     signed = {JOURNAL: contents.signature}

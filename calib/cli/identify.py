@@ -13,10 +13,11 @@ from calib.cli.arguments import (
     known_point,
     written_text,
 )
+from calib.estimation.priors import Priors
 from calib.estimation.result import Extra
 from calib.identification import EstimationOptions, identify, prior_calibration
 from calib.lever_arms.gauge import Gauge, LeverArms, convert
-from calib.reports.identification import document, report_html
+from calib.reports.identification import report_html, terminal_document
 from calib.reports.text import print_document
 from calib.reports.truth import comparison
 from calib.result_file import result_document, write_json
@@ -26,7 +27,14 @@ from imudrv.cli.arguments import add_profile
 from imudrv.errors import InputError
 from imudrv.files.atomic import atomic_write
 from imudrv.files.inputs import total_size
+from imudrv.imu.rate_filter import NAMES
 from imudrv.terminal import progress, say
+from imudrv.units import PPM, UG, URAD
+
+MAX_SIGMA: Final = 1e5
+LEAST_SIGMA: Final = 0.01
+"""Range of the standard uncertainty of a prior, in the unit of its option."""
+
 
 EXAMPLE: Final = (
     "z-up.raw x-up.raw y-up.raw --profile imu50-rs422 --calibration unit.yaml --site site.yaml -o new.yaml"
@@ -54,9 +62,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--pivot", choices=("free", "fixed"), default="free", help=text)
     text = "estimate more parameters"
     add("--estimate", choices=get_args(Extra), help=text)
+    text = "filter of the rates in H; auto: dither wherever the sample rate allows it (default)"
+    add("--rate-filter", choices=("auto", *NAMES), default="auto", help=text)
+    text = (
+        "1 sigma of the gyro-accelerometer skew about that of the calibration; 0: known exactly; default: "
+        "that of the calibration, or else 0.5"
+    )
+    add("--skew-sigma-ms", type=_sigma, metavar="MS", help=text)
+    text = (
+        "1 sigma of the biases, scale factors and misalignments of the calibration; default: those in the "
+        "calibration, or else 100 ug, 50 ppm and 100 urad"
+    )
+    add("--prior-sigma", type=_sigma, nargs=3, metavar=("UG", "PPM", "URAD"), help=text)
     add_certificate_output(parser)
     add("--json", type=Path, metavar="R.json", help="the whole result as JSON")
     add("--report", type=Path, metavar="R.html", help="report with figures, one file")
+    add("-v", "--verbose", action="store_true", help="print the whole report, not only the result")
     text = "true unit of a simulation: the result is compared with it at the end, and does not depend on it"
     add("--truth", type=Path, metavar="T.yaml", help=text)
 
@@ -75,6 +96,9 @@ def run(arguments: argparse.Namespace) -> None:
         arguments.pivot,
         nine=arguments.gauge == "given" and point is None,
         extra=(arguments.estimate,) if arguments.estimate else (),
+        rate_filter=arguments.rate_filter,
+        priors=_priors(arguments.prior_sigma),
+        skew_sigma_s=None if arguments.skew_sigma_ms is None else arguments.skew_sigma_ms * 1e-3,
     )
     with progress("identify", total_size(arguments.captures * 2)) as advance:  # each is read twice
         result = identify(
@@ -100,11 +124,37 @@ def run(arguments: argparse.Namespace) -> None:
         write(arguments.output, certificate(result, arms), key)
         written.append(written_text(arguments.output, prior.calibration, arms))
     finally:
-        print_document(document(result, gauges))
+        print_document(terminal_document(result, gauges, arguments.verbose))
         say("\n".join(written))
     if arguments.truth is not None:
         true = lever_arms_of(read_calibration(arguments.truth), str(arguments.truth))
         print_document(comparison(arms, true, arguments.truth.name))
+
+
+def _sigma(text: str) -> float:
+    """Parse a standard uncertainty."""
+    value = float(text)
+    if not 0.0 <= value <= MAX_SIGMA:
+        raise argparse.ArgumentTypeError(f"expected a number from 0 to {MAX_SIGMA:g}, got {text}")
+    return value
+
+
+def _priors(sigma: list[float] | None) -> Priors | None:
+    """Return the priors of option --prior-sigma."""
+    if sigma is None:
+        return None
+    if min(sigma) < LEAST_SIGMA:
+        raise InputError(
+            f"--prior-sigma: expected three numbers from {LEAST_SIGMA:g} up, got {min(sigma):g}; give the "
+            "accuracy of the calibration"
+        )
+    bias_ug, scale_ppm, misalignment_urad = sigma
+    return Priors(
+        accelerometer_bias=bias_ug * UG,
+        accelerometer_scale=scale_ppm * PPM,
+        accelerometer_misalignment=misalignment_urad * URAD,
+        gyro_misalignment=misalignment_urad * URAD,
+    )
 
 
 def _in_gauge(arms: LeverArms, gauge: Gauge | None, point: tuple[str, list[float]] | None) -> LeverArms:

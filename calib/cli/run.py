@@ -6,6 +6,8 @@ from typing import Final
 
 from calib.bench.run import RunOptions, new_folder
 from calib.bench.run import run as run_session
+from calib.bench.technician import MISTAKES
+from calib.bench.web_console import ADDRESS
 from calib.procedure import plan
 from imudrv.cli.arguments import add_profile
 from imudrv.terminal import console
@@ -23,6 +25,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = "certificate of the unit; replaced when you accept the new one"
     add("--calibration", type=Path, metavar="C.yaml", help=text)
     add("--site", type=Path, metavar="S.yaml", help="site of the bench: latitude, longitude, height")
+    text = "who calibrates, where and with what, for the certificate; default: ~/.config/imu50/bench.yaml"
+    add("--bench", type=Path, metavar="B.yaml", help=text)
+    add("--operator", metavar="NAME", help="who conducts the session; asked at a terminal")
+    add(
+        "--unit",
+        metavar="SERIAL",
+        help="serial number on the unit; another one than the certificate's is refused",
+    )
     add("--procedure", metavar="P", help=f"{', '.join(plan.shipped())}, or a procedure file")
     text = "folder for journal and recordings; an existing session is resumed"
     add("--session", dest="folder", type=Path, default=new_folder(), metavar="DIR", help=text)
@@ -33,8 +43,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="only show the steps, how long they take, and the expected accuracy",
     )
-    add("--hands-free", action="store_true", help="continue by the sensors alone, without keys")
+    add(
+        "--hands-free",
+        action="store_true",
+        help="continue by the sensors alone; the result is accepted at a terminal, or with --accept",
+    )
+    text = "accept the result without a person, unless a verdict is bad"
+    add("--accept", action="store_true", help=text)
+    add("--pdf", action="store_true", help="the report as PDF, too; needs chromium or weasyprint")
+    add("--language", metavar="L", help="en or zh_CN; default: the system's")
     add("--rehearse", action="store_true", help="use a simulated unit and technician")
+    text = f"a page for browsers, beside the terminal; default address: {ADDRESS}, for this machine only"
+    add("--web", nargs="?", const=ADDRESS, metavar="HOST:PORT", help=text)
+    text = "in a rehearsal: you press the keys, and the technician does what the screen says"
+    add("--keys", action="store_true", help=text)
+    text = f"in a rehearsal: random, or some of {', '.join(k.replace(' ', '-') for k in MISTAKES)}, by commas"
+    add("--mistakes", default="", metavar="LIST", help=text)
     add("--speed", default="1", metavar="X", help="speed of the rehearsal: 1, 10, ... or max")
 
 

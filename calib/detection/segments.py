@@ -112,7 +112,7 @@ class Rest(Interval):
 
 @dataclass(frozen=True)
 class Rotation(Interval):
-    """A motion between two rests; `calib.detection.acceptance.assess` accepts or rejects it.
+    """A motion between two rests; `calib.detection.turns.find_runs` accepts or rejects it.
 
     Attributes
     ----------
@@ -165,9 +165,16 @@ class Segments:
 
 
 class Segmenter:
-    """Detector of rests and motions; the result does not depend on how the increments are divided."""
+    """Detector of rests and motions; the result does not depend on how the increments are divided.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    begin_s : float
+        Time of the first sample from the beginning of the capture.
+    """
+
+    def __init__(self, begin_s: float = 0.0) -> None:
+        self._begin_s = begin_s
         self._store = BlockStore()
         self._sums: BlockSums | None = None
         self._waiting = np.zeros(0, INCREMENTS)
@@ -220,7 +227,7 @@ class Segmenter:
             )
         size = self._samples_a_block
         end = self._last + 1 if incomplete is None else self._first + incomplete * size
-        return _segments(_Blocks(self._store, size, self._first, end, self._nominal_ns * NS))
+        return _segments(_Blocks(self._store, size, self._first, end, self._nominal_ns * NS, self._begin_s))
 
 
 def find_segments(pieces: Iterable[Records]) -> Segments:
@@ -254,6 +261,7 @@ class _Blocks(NamedTuple):
     first: int  # counter of the first sample
     end: int  # counter after the last sample
     interval_s: float
+    begin_s: float  # time of the first sample
 
     @property
     def per_second(self) -> int:
@@ -282,7 +290,7 @@ class _Blocks(NamedTuple):
 
     def seconds(self, block: int) -> float:
         """Return the time at a block's beginning, s."""
-        return (self.counter(block) - self.first) * self.interval_s
+        return self.begin_s + (self.counter(block) - self.first) * self.interval_s
 
 
 def _segments(blocks: _Blocks) -> Segments:

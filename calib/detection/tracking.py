@@ -14,10 +14,10 @@ from calib.axes import axis_name
 from calib.detection.blocks import BLOCK_NS, Block
 from calib.messages import Message, message
 from imudrv.arrays import Array
-from imudrv.nav.attitude import Quaternion, conjugate, product, quaternion_of_vector, turn, unit
+from imudrv.nav.attitude import Quaternion, conjugate, product, quaternion_of_vector, rows_of, turn, unit
 from imudrv.nav.earth import earth_rate_n
 from imudrv.units import DEG, NS, STANDARD_GRAVITY
-from imudrv.vectors import Vector, add, dot, scale, subtract
+from imudrv.vectors import Vector, add, cross, dot, scale, subtract
 
 SMOOTH_S: Final = 0.2
 """Time constant of the smoothed gravity while the unit is carried, s."""
@@ -155,6 +155,19 @@ class AttitudeTracker:
         if self.force is None:
             return pi
         return acos(max(-1.0, min(1.0, dot(self.force, _vector(axis_b)) / hypot(*self.force))))
+
+    def C_nb(self, east_b: Array) -> tuple[Vector, Vector, Vector] | None:
+        """Return the attitude; before an alignment, with an axis about east. None: unknown."""
+        if self.q_nb is not None:
+            return rows_of(self.q_nb)
+        if self.force is None or not (size := hypot(*self.force)):
+            return None
+        up = scale(1.0 / size, self.force)
+        level = cross(cross(up, _vector(east_b)), up)
+        if hypot(*level) < 0.1:  # the axis is nearly vertical
+            level = cross(up, (up[2], up[0], up[1]))
+        east = scale(1.0 / hypot(*level), level)
+        return east, cross(up, east), up
 
     def azimuth(self, axis_b: Array) -> float | None:
         """Return the azimuth of an axis, from north to east, rad, -pi to pi; None: unknown."""

@@ -1,22 +1,8 @@
 """Joint estimate of the lever arms and the residual calibration errors from all rests.
 
-The velocity at rest is linear in the residual errors of the increments (mathematics, section 4; the matrices
-H, B, P, Q are those of `imudrv.nav.mechanisation`). Measured minus true, horizontal components:
-
-    delta v = H R + B b_a + A vec(dA) + f x ( integral of phi )
-    phi(t)  = (I - t [omega_ie x]) phi_0 - B b_g - P vec(dG)
-
-with the integral of C_nb dA f_b = A vec(dA). The errors of tilt and heading at the start of each run, phi_0,
-are parameters of that run; all others are common to the session. Heading is included because the Earth's
-rotation turns its error into a tilt rate as large as that of a gyro bias: the alignment has chosen the
-heading that compensates the bias in the first pose, and the rotation makes both observable.
-
-**Noise.** Pulses cause white noise of velocity, once more at the start of a run; accelerometers a random
-walk q_v; gyros a random walk q_a of tilt, which gravity integrates. Over a run
-
-    cov(s, t) = q_v^2 min(s, t) + g^2 q_a^2 s^2 (3 t - s) / 6 + start^2 + white^2 [s = t],      s <= t
-
-Their magnitudes are estimated from the rests. Rows are whitened by the Cholesky factor.
+The velocity at rest is linear in the residual errors of the increments (`calib.estimation.design`); its noise
+and the equations are those of `calib.estimation.linear_system`. R is estimated twice: the effect of the
+misalignments on the size effect itself is linear only for known arms.
 
 **Rank.** An eigenvalue l of the information on R, all other parameters marginalised, gives its direction a
 sigma of 1 / sqrt(l). A direction whose sigma is not below `Priors.arm` is unobservable. Rotations between
@@ -29,35 +15,34 @@ from typing import Final, Literal
 
 import numpy as np
 
+from calib.estimation.consistency import leave_one_out, scatter_and_redundancy
+from calib.estimation.design import Design, Known
+from calib.estimation.gains import Fit, rest_growth, run_result, singular_values_of, velocity_gains
 from calib.estimation.linear_system import (
     NormalEquations,
     Parameters,
-    parameter_groups,
+    extra_terms,
     prior_parameters,
-    rank_reason,
-    require_runs,
-    rest_noise,
     run_equations,
-    run_result,
-    singular_values_of,
-    unobservable_text,
-    velocity_gains,
 )
+from calib.estimation.noise import SensorNoise, noise_of
+from calib.estimation.observability import rank_reason, require_axes, require_runs, unobservable_text
+from calib.estimation.priors import Priors
 from calib.estimation.result import (
     CENTROID_BASIS,
-    CHI_SQUARE_LIMIT,
+    SCATTER_LIMIT,
+    TO_DIFFERENCES,
     Extra,
-    LeaveOneOut,
     LeverArmEstimate,
     ParameterEstimate,
 )
-from calib.estimation.runs import Priors, Run
+from calib.estimation.runs import Run
 from imudrv.arrays import Array
 from imudrv.errors import InputError
 from imudrv.units import STANDARD_GRAVITY, UG
 
 PIVOT_LIMIT: Final = 10.0
-"""Largest reduction of chi-square per component by a separate pivot for each rotation."""
+"""Largest reduction of chi-square per component by a separate pivot for each run."""
 
 
 PIVOT_SIGMA: Final = 0.1
@@ -96,11 +81,11 @@ def estimate_joint(
     Raises
     ------
     InputError
-        There are no runs; nine components without a known pivot; the rotations do not determine the
-        required directions; or the data contradict the pivot.
+        There are no runs, or no pulses for the noise; nine components without a known pivot; the rotations do
+        not determine the required directions; or the data contradict the pivot.
     """
     priors = priors or Priors()
-    terms = parameter_groups(priors, extra)
+    terms = extra_terms(priors, extra)
     require_runs(runs)
     if nine and pivot == "free":
         raise InputError(
@@ -108,86 +93,107 @@ def estimate_joint(
             "rotations between rests determine six, as a common shift of the three sensing points causes no "
             "velocity at rest; choose another gauge, or turn the unit about a fixed point and use pivot fixed"
         )
-    noise = rest_noise(runs)
-    system = NormalEquations(
-        [run_equations(run, noise, pivot, terms) for run in runs], prior_parameters(runs, priors, terms)
-    )
+    noise = noise_of(runs)
+    parameters = prior_parameters(runs, priors, terms)
     basis = np.eye(9) if pivot == "fixed" else CENTROID_BASIS
+    designs, system = _equations(runs, noise, pivot, parameters)
     sigma, directions = system.directions()
     rank = int((sigma < priors.arm).sum())
-    wanted = basis.shape[1]
-    if rank < wanted:
+    if rank < basis.shape[1]:
+        require_axes(runs)
         raise InputError(unobservable_text(sigma, directions, basis, priors.arm))
+    x, _ = system.solve(basis)
+    known = [design.known(x[system.columns_of(k)]) for k, design in enumerate(designs)]
+    designs, system = _equations(runs, noise, pivot, parameters, known)
+    sigma, _ = system.directions()
     x, covariance = system.solve(basis)
-    chi_square, freedom = system.chi_square(x, wanted)
-    if pivot == "fixed":
-        _check_pivot(system, chi_square, freedom)
-    names = system.parameters.names
-    spread = np.sqrt(np.diag(covariance))
-    parameters = tuple(
-        ParameterEstimate(name, float(value), float(s), float(prior))
-        for name, value, s, prior in zip(names, x[9:], spread[9:], system.parameters.sigma, strict=True)
+    R = x[:9]
+    scatter, redundancy = scatter_and_redundancy(
+        system, x, covariance, basis, noise, in_motion=pivot == "fixed"
     )
+    if pivot == "fixed":
+        _check_pivot(system, x)
+    cut = 9 + len(parameters.names)
+    spread = np.sqrt(np.diag(covariance))
+    found = tuple(
+        ParameterEstimate(name, float(value), float(s), float(prior))
+        for name, value, s, prior in zip(
+            parameters.names, x[9:cut], spread[9:cut], parameters.sigma, strict=True
+        )
+    )
+    labels = [
+        label for run in runs for label, turn in zip(run.turn_labels, run.turns, strict=True) if turn.accepted
+    ]
     return LeverArmEstimate(
         method="joint",
         gauge="given" if pivot == "fixed" else "centroid",
-        R_b=x[:9].reshape(3, 3),
+        R_b=R.reshape(3, 3),
         covariance=covariance[:9, :9],
         rank=rank,
         direction_sigma=sigma,
         singular_values=singular_values_of(velocity_gains(runs)),
         reason=rank_reason(rank, sigma, priors.arm),
-        chi_square=chi_square,
-        degrees_of_freedom=freedom,
+        scatter=scatter,
+        redundancy=redundancy,
         noise=noise,
-        parameters=parameters,
-        correlation=covariance[:9, 9:] / np.outer(np.maximum(spread[:9], 1e-300), spread[9:]),
-        leave_one_out=tuple(
-            _without(system, k, run.label, x, basis, priors.arm) for k, run in enumerate(runs)
-        ),
+        dither_error=_dither_error(runs, system, R, covariance),
+        parameters=found,
+        correlation=covariance[:9, 9:cut] / np.outer(np.maximum(spread[:9], 1e-300), spread[9:cut]),
+        leave_one_out=leave_one_out(system, x, covariance, basis, priors.arm, labels),
         runs=tuple(
-            run_result(run, x[:9], part.t_s, part.v_n, part.columns @ x[system.columns_of(k)])
-            for k, (run, part) in enumerate(zip(runs, system.parts, strict=True))
+            run_result(run, R, _fit(designs[k], x[system.columns_of(k)])) for k, run in enumerate(runs)
         ),
         notes=tuple(
             f"{n.name} not observable in these runs: sigma {n.sigma * STANDARD_GRAVITY**2 / UG:.3g} ug/g^2"
-            for n in parameters
+            for n in found
             if n.name.startswith("quadratic") and not n.observable
         ),
     )
 
 
-def _check_pivot(system: NormalEquations, chi_square: float, freedom: int) -> None:
-    """Refuse a pivot that the data contradict: a separate one for each rotation fits much better."""
-    runs, cut = len(system.parts), 9 + system.parameters.shared
-    own = np.split(system.parameters.sigma[system.parameters.shared :], runs)
-    sigma = np.concatenate([np.append(phi, np.full(3, PIVOT_SIGMA)) for phi in own])
-    size = cut + len(own[0])
-    M = np.zeros((size, size + 3))  # a shift of the origin shifts all three points
-    M[:, :size], M[:9, size:] = np.eye(size), np.tile(np.eye(3), (3, 1))
-    separate = NormalEquations(
-        [
-            part._replace(columns=part.columns @ M, N=M.T @ part.N @ M, b=M.T @ part.b)
-            for part in system.parts
-        ],
-        Parameters((), np.concatenate([system.parameters.sigma[: system.parameters.shared], sigma]), cut - 9),
-    )
-    x, _ = separate.solve(np.eye(9))
-    better, _ = separate.chi_square(x, 9)
-    if chi_square - better > PIVOT_LIMIT * 3 * runs or chi_square > CHI_SQUARE_LIMIT * freedom:
+def _equations(
+    runs: Sequence[Run],
+    noise: SensorNoise,
+    pivot: str,
+    parameters: Parameters,
+    known: Sequence[Known | None] | None = None,
+) -> tuple[list[Design], NormalEquations]:
+    """Return the equations of all runs, to second order with a first estimate."""
+    known = known or [None] * len(runs)
+    designs = [Design(run, parameters.terms, first) for run, first in zip(runs, known, strict=True)]
+    equations = [run_equations(run, noise, pivot, design) for run, design in zip(runs, designs, strict=True)]
+    return designs, NormalEquations(equations, parameters)
+
+
+def _fit(design: Design, x: Array) -> Fit:
+    """Return the function of the estimated velocity at rest."""
+    return lambda t_s, arrest: np.asarray(design.at(t_s, arrest) @ x, np.float64)
+
+
+def _dither_error(runs: Sequence[Run], system: NormalEquations, R: Array, covariance: Array) -> float:
+    """Return the largest error of a difference by the H that grows at rest, in its sigma.
+
+    In a turn H grows by the same rate in error, which H R takes for size effect.
+    """
+    b = np.zeros(len(covariance))
+    for k, run in enumerate(runs):
+        durations = np.cumsum([0.0, *(turn.duration_s for turn in run.turns)])
+        error = run.readings.direction_n @ (rest_growth(run) @ R) * durations[run.readings.arrest]
+        part = system.parts[k]
+        b[system.columns_of(k)] += part.A.T @ part.whitened(error)
+    shift = TO_DIFFERENCES @ (covariance @ b)[:9]
+    sigma = np.sqrt(np.diag(TO_DIFFERENCES @ covariance[:9, :9] @ TO_DIFFERENCES.T))
+    return float(np.abs(shift / sigma).max())
+
+
+def _check_pivot(system: NormalEquations, x: Array) -> None:
+    """Refuse a pivot that the data contradict: a separate one for each run fits much better."""
+    separate = system.with_pivots(PIVOT_SIGMA)
+    chi_square, better = system.chi_square(x), separate.chi_square(separate.solve(np.eye(9))[0])
+    freedom, runs = system.count - 9, len(system.parts)
+    if chi_square - better > PIVOT_LIMIT * 3 * runs or chi_square > SCATTER_LIMIT * freedom:
         raise InputError(
             "identification: pivot fixed: expected the origin of b to stay still, but the velocities "
             f"contradict it: chi-square {chi_square:.0f}, expected about {freedom}, and {better:.0f} with an "
-            "origin of its own for each rotation; use pivot free, or look for what moved"
+            "origin of its own for each run; use pivot free, or look for what moved"
         )
-
-
-def _without(
-    system: NormalEquations, k: int, label: str, x: Array, basis: Array, limit: float
-) -> LeaveOneOut:
-    """Return the estimate without run k."""
-    other = system.without(k)
-    rank = int((other.directions()[0] < limit).sum())
-    if rank < basis.shape[1]:
-        return LeaveOneOut(label, rank, None)
-    return LeaveOneOut(label, rank, (other.solve(basis)[0] - x)[:9].reshape(3, 3))

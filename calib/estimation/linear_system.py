@@ -1,45 +1,55 @@
-"""Design matrix, noise covariance and normal equations of a session; observability."""
+"""Normal equations of a session: all readings of all runs, and the priors.
 
-from collections.abc import Sequence
+**Noise.** The readings of a run along the directions d and e have the covariance
+
+    cov = d . e ( q_v^2 s + g^2 q_a^2 s^2 (3 t - s) / 6 ) + d (Sigma_0 + n Sigma_1) e,      s <= t
+
+plus the variance of each reading on its own. Accelerometers make a random walk q_v of velocity, gyros a
+random walk q_a of tilt, which gravity integrates; Sigma_0 is the fraction of a pulse at the start of the run,
+and Sigma_1 what the pulses add at each of the n turns before s. The arrests of a run are readings of one
+walk: rows are whitened by the Cholesky factor, as differences of successive arrests would be for q_v alone.
+
+**Unknowns** are R; the errors common to all runs; those of each run; and a step of velocity at each turn,
+east and north. The step is zero, except at a turn outside its limits. Freeing it takes a turn out of the
+estimate and leaves its rests in.
+"""
+
+from collections.abc import Iterable, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
-from scipy.spatial.transform import Rotation as Attitude
+from scipy.linalg import block_diag, solve_triangular
 
-from calib.detection.blocks import BLOCK_NS
-from calib.detection.noise import BIN_S, Noise, pooled_noise
-from calib.detection.segments import Rest
-from calib.estimation.result import Extra, RunResult, TurnResult
-from calib.estimation.runs import Priors, Run
+from calib.estimation.design import Design, back_action, interpolated
+from calib.estimation.noise import SensorNoise
+from calib.estimation.priors import SHARED, Priors
+from calib.estimation.result import Extra
+from calib.estimation.runs import Run
 from imudrv.arrays import Array
-from imudrv.errors import InputError
-from imudrv.nav.earth import earth_rate_n
-from imudrv.units import MM, NS
 
-ROWS_PER_BIN: Final = round(BIN_S / (BLOCK_NS * NS))
-"""Rows at rest that are averaged into one equation."""
+TILT_SIGMA: Final = 5e-3
+"""Prior sigma of the initial tilts, rad; wide, because the rest before the first turn determines them."""
+
+
+OWN: Final = {
+    "phi": ("east", "north", "up"),
+    "accelerometer_bias": ("x", "y", "z"),
+    "gyro_bias": ("x", "y", "z"),
+}
+"""Parameters of a run."""
+
+
+STEP_SIGMA: Final = 10.0
+"""Prior sigma of the step of velocity at a turn outside its limits, m/s."""
 
 
 ROWS_PER_POINT: Final = 5
 """With a known pivot, every n-th row during the motion also becomes an equation."""
 
 
-GAIN_WINDOW_S: Final = 0.5
-"""Averaging window for the velocity before and after the rotation, s."""
-
-
-OWN_RATIO: Final = 2.0
-"""A rest whose white noise exceeds the pooled value by this factor keeps its own."""
-
-
-TILT_SIGMA: Final = 5e-3
-"""Prior sigma of the initial tilts, rad; wide, because the rest before the rotation determines them."""
-
-
-LEAST_NOISE: Final = Noise(angle_walk=1e-7, velocity_walk=1e-6, velocity_white=3e-6, velocity_pulse=3e-5)
-"""Lower bound of the noise, for the effects that linear equations neglect."""
+LEAST_MOTION: Final = 3e-5
+"""Smallest error of a velocity in motion, m/s, for what linear equations neglect."""
 
 
 ROUNDING: Final = 1e-7
@@ -47,344 +57,226 @@ ROUNDING: Final = 1e-7
 
 
 class Parameters(NamedTuple):
-    """Names and priors of a session's parameters other than R, in the order of their columns.
+    """All parameters but R and the steps: those common to all runs, then those of each run.
 
     Attributes
     ----------
     names : tuple of str
         Such as 'accelerometer_bias_x'.
-    sigma : ndarray, shape (n,)
-        Prior sigmas, SI.
+    expected : ndarray, shape (n,)
+        Expected values, SI.
+    covariance : ndarray, shape (n, n)
+        Prior covariance.
     shared : int
-        Number of parameters common to all runs; those of the first run, the second, ... follow.
+        Number of parameters common to all runs.
+    terms : tuple of {'skew', 'quadratic'}
+        Those beyond biases and matrices.
     """
 
     names: tuple[str, ...]
-    sigma: Array
+    expected: Array
+    covariance: Array
     shared: int
+    terms: tuple[str, ...]
 
-    def columns_of(self, k: int, runs: int) -> NDArray[np.int64]:
-        """Return the columns, R first, of the parameters of run k of `runs`."""
-        own = (len(self.sigma) - self.shared) // runs
-        shared = 9 + self.shared
-        return np.concatenate([np.arange(shared), shared + own * k + np.arange(own)])
+    @property
+    def sigma(self) -> Array:
+        """Prior sigmas, SI."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)), np.float64)
 
 
 class RunEquations(NamedTuple):
-    """Equations of a run, `v = columns @ (R, shared, phi_0)`, and their whitened sums."""
+    """Whitened equations of a run, `v = A @ (R, shared, own, steps)`."""
 
-    t_s: Array  # (n,)
-    v_n: Array  # (n, 2), or (n, 3) with a known pivot
-    columns: Array  # (n, 2 or 3, 9 + shared + 3)
-    N: Array
-    b: Array
-    yy: float
+    L: Array  # (n, n), Cholesky factor of the covariance of the noise
+    A: Array
+    v: Array  # (n,)
+    accepted: tuple[bool, ...]  # of each turn
+
+    def whitened(self, y: Array) -> Array:
+        """Return whitened values of the first equations; those of the others are zero."""
+        padded = np.zeros(len(self.L))
+        padded[: len(y)] = y
+        return np.asarray(solve_triangular(self.L, padded, lower=True), np.float64)
 
 
-class NormalEquations:
-    """Normal equations of a session for R, the parameters common to all runs, and phi_0 of each run."""
-
-    def __init__(self, parts: Sequence[RunEquations], parameters: Parameters) -> None:
-        self.parts, self.parameters = parts, parameters
-        self.scale = np.concatenate([np.full(9, 0.1), parameters.sigma])
-        n = len(self.scale)
-        self.N, self.b = np.diag(np.concatenate([np.zeros(9), parameters.sigma**-2])), np.zeros(n)
-        for k, part in enumerate(parts):
-            at = self.columns_of(k)
-            self.N[np.ix_(at, at)] += part.N
-            self.b[at] += part.b
-
-    def columns_of(self, k: int) -> NDArray[np.int64]:
-        """Return the columns of a run's parameters."""
-        return self.parameters.columns_of(k, len(self.parts))
-
-    def without(self, k: int) -> "NormalEquations":
-        """Return the equations without the data of a run."""
-        other = object.__new__(NormalEquations)
-        other.parts, other.parameters, other.scale = self.parts, self.parameters, self.scale
-        other.N, other.b = self.N.copy(), self.b.copy()
-        at = self.columns_of(k)
-        other.N[np.ix_(at, at)] -= self.parts[k].N
-        other.b[at] -= self.parts[k].b
-        return other
-
-    def directions(self) -> tuple[Array, Array]:
-        """Return 1-sigma of the principal directions of R, best first, and the directions as columns."""
-        N = self.N * np.outer(self.scale, self.scale)
-        information = N[:9, :9] - N[:9, 9:] @ np.linalg.solve(N[9:, 9:], N[9:, :9])
-        values, vectors = np.linalg.eigh(0.5 * (information + information.T))
-        least = ROUNDING**2 * values[-1]
-        return self.scale[0] / np.sqrt(np.maximum(values[::-1], least)), vectors[:, ::-1]
-
-    def solve(self, basis: Array) -> tuple[Array, Array]:
-        """Return estimate and covariance of all parameters, R within the span of `basis`."""
-        n = len(self.scale)
-        T = np.zeros((n, n - 9 + basis.shape[1]))
-        T[:9, : basis.shape[1]], T[9:, basis.shape[1] :] = basis, np.eye(n - 9)
-        T *= self.scale[:, None]
-        covariance = T @ np.linalg.inv(T.T @ self.N @ T) @ T.T
-        return covariance @ self.b, covariance
-
-    def chi_square(self, x: Array, of_R: int) -> tuple[float, int]:
-        """Return chi-square of residuals and priors, and degrees of freedom; each prior is an equation."""
-        yy = sum(part.yy for part in self.parts)
-        count = sum(part.v_n.size for part in self.parts)
-        return float(yy - 2.0 * self.b @ x + x @ self.N @ x), count - of_R
+def extra_terms(priors: Priors, extra: Sequence[Extra]) -> tuple[str, ...]:
+    """Return the parameters beyond biases and matrices: skew, unless known exactly, and the extra ones."""
+    return (*(("skew",) if priors.skew else ()), *extra)
 
 
 def prior_parameters(runs: Sequence[Run], priors: Priors, terms: Sequence[str]) -> Parameters:
-    """Return names and priors of all parameters but R."""
-    off = ~np.eye(3, dtype=bool)
-    accelerometer = np.where(off, priors.accelerometer_misalignment, priors.accelerometer_scale)
-    gyro = np.where(off, priors.gyro_misalignment, priors.gyro_scale)
-    entries = [f"{a}{b}" for a in "xyz" for b in "xyz"]
-    groups: list[tuple[str, Sequence[str], Array]] = [
-        ("accelerometer_bias", "xyz", np.full(3, priors.accelerometer_bias)),
-        ("accelerometer_matrix", entries, accelerometer.ravel()),
-        ("gyro_bias", "xyz", np.full(3, priors.gyro_bias)),
-        ("gyro_matrix", entries, gyro.ravel()),
-    ]
+    """Return names and priors of all parameters but R and the steps."""
+    names, variances = list(SHARED), [priors.shared_covariance]
+    expected = np.zeros(len(SHARED))
     if "skew" in terms:
-        groups.append(("skew", ("s",), np.array([priors.skew])))
+        names.append("skew_s")
+        variances.append(np.array([[priors.skew**2]]))
+        expected = np.append(expected, priors.expected_skew)
     if "quadratic" in terms:
-        groups.append(("quadratic", "xyz", np.full(3, priors.quadratic)))
-    shared = sum(len(sigma) for _, _, sigma in groups)
-    groups += [
-        (
-            f"phi {run.label}",
-            ("east", "north", "up"),
-            np.array([TILT_SIGMA, TILT_SIGMA, run.aligned.heading_sigma_rad]),
-        )
-        for run in runs
-    ]
-    names = tuple(f"{name}_{part}" for name, parts, _ in groups for part in parts)
-    return Parameters(names, np.concatenate([sigma for _, _, sigma in groups]), shared)
+        names += [f"quadratic_{axis}" for axis in "xyz"]
+        variances.append(priors.quadratic**2 * np.eye(3))
+    shared = len(names)
+    for run in runs:
+        for name, parts in (
+            ("phi", ("east", "north", "up")),
+            ("accelerometer_bias", "xyz"),
+            ("gyro_bias", "xyz"),
+        ):
+            names += [f"{name} {run.label}_{part}" for part in parts]
+        sigma = [TILT_SIGMA, TILT_SIGMA, run.aligned.heading_sigma_rad]
+        sigma += 3 * [priors.accelerometer_bias_of_run] + 3 * [priors.gyro_bias_of_run]
+        variances.append(np.diag(np.square(sigma)))
+    expected = np.concatenate([expected, np.zeros(len(names) - len(expected))])
+    return Parameters(
+        tuple(names), expected, np.asarray(block_diag(*variances), np.float64), shared, tuple(terms)
+    )
 
 
-def rest_noise(runs: Sequence[Run]) -> Noise:
-    """Return the noise of all rests of the runs, each counted once."""
-    rests = {(run.label.partition("#")[0], rest.start): rest for run in runs for rest in rests_of(run)}
-    found = vars(pooled_noise(rest.differences for rest in rests.values()))
-    return Noise(**{name: max(value, getattr(LEAST_NOISE, name)) for name, value in found.items()})
-
-
-def rests_of(run: Run) -> list[Rest]:
-    """Return the rest of each arrest."""
-    return [run.turns[0].before, *(turn.after for turn in run.turns)]
-
-
-def bin_variance(rest: Rest, noise: Noise) -> float:
-    """Return the variance of a bin's mean beyond that of the random walk to its middle.
-
-    A rest with much more white noise keeps its own: a level accelerometer with at most one pulse per second
-    does not average out in a bin. The mean of a random walk varies less than its value in the middle.
-    """
-    own = rest.noise.velocity_white if rest.noise is not None else 0.0
-    white = own if own > OWN_RATIO * noise.velocity_white else noise.velocity_white
-    return white**2 - noise.velocity_walk**2 * BIN_S / 6.0
-
-
-def noise_covariance(t: Array, single: Array, noise: Noise, gravity: float) -> Array:
-    """Return the covariance of velocities of one axis at the times t; `single`: independent variances."""
-    s, u = np.minimum.outer(t, t), np.maximum.outer(t, t)
-    walk, tilt = noise.velocity_walk**2, (gravity * noise.angle_walk) ** 2
-    K = walk * s + tilt * s * s * (3.0 * u - s) / 6.0 + noise.velocity_pulse**2 + np.diag(single)
-    return np.asarray(K, np.float64)
-
-
-def design_columns(run: Run, terms: Sequence[str]) -> Array:
-    """Return the derivatives of velocity by R, shared parameters and phi_0, (n, 3, 9 + shared + 3)."""
-    rows, t = run.rows, run.t_s
-    C_nb = Attitude.from_quat(np.roll(rows["q_nb"], -1, axis=1)).as_matrix()
-    dt = np.diff(t, prepend=0.0)
-    B = rows["B"]
-    dB = np.diff(B, axis=0, prepend=np.zeros((1, 3, 3)))
-    dB_dt = dB / dt[:, None, None]  # the mean C_nb over a row
-    f_n = np.diff(rows["v_n"], axis=0, prepend=np.zeros((1, 3))) / dt[:, None] + [0.0, 0.0, run.gravity]
-    f_b = np.einsum("nji,nj->ni", dB_dt, f_n)
-    A = np.cumsum(np.einsum("nij,nk->nijk", dB, f_b).reshape(-1, 3, 9), axis=0)
-    integral_of_B = np.cumsum(dt[:, None, None] * (B - 0.5 * dB), axis=0)
-    earth = earth_rate_n(float(rows["latitude_rad"][0]))
-    turning = np.cross(np.eye(3), earth)  # [omega_ie x]
-    integral_of_phi = t[:, None, None] * np.eye(3) - 0.5 * (t * t)[:, None, None] * turning
-    parts = [
-        _settled_H(run, 2.0 * turning),
-        B,
-        A,
-        _tilted(-integral_of_B, run.gravity),
-        _tilted(-rows["Q"], run.gravity),
-    ]
-    if "skew" in terms:
-        parts.append(_skew_column(run, C_nb, f_n, f_b))
-    if "quadratic" in terms:
-        parts.append(np.cumsum(dB * (f_b * f_b)[:, None, :], axis=0))
-    return np.concatenate([*parts, _tilted(integral_of_phi, run.gravity)], axis=2)
-
-
-def _skew_column(run: Run, C_nb: Array, f_n: Array, f_b: Array) -> Array:
-    """Return the derivative of the velocity by a skew s: the accelerometers sense `f_b(t + s)`.
-
-        integral of C_nb df_b = f_n(t) - f_n(0) - integral of dC_nb f_b
-
-    At rest the first two cancel. In motion f_n is the mean of the adjacent rows, because a row's own noise is
-    also in its velocity.
-    """
-    moving = ~run.at_rest
-    column = -np.cumsum(np.einsum("nij,nj->ni", np.diff(C_nb, axis=0, prepend=C_nb[:1]), f_b), axis=0)
-    later = np.concatenate([f_n[1:], f_n[-1:]])
-    column[moving] += 0.5 * (f_n + later)[moving] - [0.0, 0.0, run.gravity]
-    return column[:, :, None]
-
-
-def _settled_H(run: Run, coriolis: Array) -> Array:
-    """Return H of each row, at rest without the noise of the rate at a row's end.
-
-    At rest H is constant except for the Coriolis acceleration; before the first turn it is zero. That noise,
-    up to 2e-3 m/s per metre in a single row, would look like a signal of the gauge.
-    """
-    H = run.rows["H"].copy()
-    H[run.arrests[0]] = 0.0
-    for at in run.arrests[1:]:
-        t, mean = run.t_s[at], H[at].mean(axis=0)
-        H[at] = mean - (t - t.mean())[:, None, None] * (coriolis @ mean)
-    return H
-
-
-def _tilted(phi: Array, gravity: float) -> Array:
-    """Return `f_n x phi` for columns phi, (n, 3, m), of a body that does not accelerate."""
-    out = np.zeros_like(phi)
-    out[:, 0], out[:, 1] = -gravity * phi[:, 1], gravity * phi[:, 0]
-    return out
-
-
-def run_equations(run: Run, noise: Noise, pivot: str, terms: Sequence[str]) -> RunEquations:
-    """Return the equations of the rests; with a known pivot also of the motion and the vertical."""
-    parts = 3 if pivot == "fixed" else 2
-    rows = arrest_bins(run)
-    single = [bin_variance(rest, noise) for rest in rests_of(run)]
+def run_equations(run: Run, noise: SensorNoise, pivot: str, design: Design) -> RunEquations:
+    """Return the equations of the readings; with a known pivot also of the motion and the vertical."""
+    readings = run.readings
+    t, d, variance = readings.t_s, readings.direction_n, readings.variance
+    columns = design.at(t, readings.arrest)
+    v = readings.v + np.einsum("ni,ni->n", d, interpolated(run.t_s, back_action(run), t))
+    A = np.einsum("ni,nij->nj", d, columns)
     if pivot == "fixed":
-        rows.append(np.flatnonzero(~run.at_rest)[::ROWS_PER_POINT, None])
-        single.append(noise.velocity_pulse**2)
-    columns = design_columns(run, terms)[:, :parts]
-
-    def mean(x: Array) -> Array:
-        return np.concatenate([x[at].mean(axis=1) for at in rows])
-
-    v_n = np.where(run.at_rest[:, None], run.v_n, run.rows["v_n"])[:, :parts]
-    t, v, A = mean(run.t_s), mean(v_n), mean(columns)
-    own = np.repeat(single, [len(at) for at in rows])
-    L = np.linalg.cholesky(noise_covariance(t, own, noise, run.gravity))
-    white_A = solve_triangular(L, A.reshape(len(t), -1), lower=True).reshape(-1, A.shape[2])
-    white_v = solve_triangular(L, v, lower=True).ravel()
-    return RunEquations(t, v, A, white_A.T @ white_A, white_A.T @ white_v, float(white_v @ white_v))
+        more = _motion(run, design)
+        t, d, v, A = (np.concatenate(pair) for pair in zip((t, d, v, A), more, strict=True))
+        coarse = float(np.trace(readings.turn)) + LEAST_MOTION**2
+        variance = np.concatenate([variance, np.full(len(t) - len(variance), coarse)])
+    passed = np.concatenate([readings.arrest, np.zeros(len(t) - len(readings.arrest), np.int64)])
+    pulses = d @ readings.start @ d.T + np.minimum.outer(passed, passed) * (d @ readings.turn @ d.T)
+    K = walk_covariance(t, d, noise, run.gravity) + pulses + np.diag(variance)
+    L = np.asarray(np.linalg.cholesky(K), np.float64)
+    white = solve_triangular(L, np.column_stack([A, v]), lower=True)
+    return RunEquations(L, white[:, :-1], white[:, -1], tuple(turn.accepted for turn in run.turns))
 
 
-def arrest_bins(run: Run) -> list[NDArray[np.int64]]:
-    """Return the rows of the bins of each arrest, (bins, rows per bin)."""
-    return [whole_bins(at, from_the_end=k == 0) for k, at in enumerate(run.arrests)]
-
-
-def whole_bins(mask: NDArray[np.bool_], from_the_end: bool) -> NDArray[np.int64]:
-    """Return the rows of each whole bin, (bins, rows per bin); surplus rows are far from the rotation."""
-    at = np.flatnonzero(mask)
-    over = len(at) % ROWS_PER_BIN
-    at = at[over:] if from_the_end else at[: len(at) - over]
-    return at.reshape(-1, ROWS_PER_BIN)
-
-
-def velocity_gain(run: Run, k: int = 0) -> tuple[Array, Array]:
-    """Return the gains V and H of turn k: means over the half second after minus those before."""
-    before, after = gain_rows(run, k)
-    rows = run.rows
-    V = run.v_n[after].mean(axis=0) - run.v_n[before].mean(axis=0)
-    return V, rows["H"][after].mean(axis=0) - rows["H"][before].mean(axis=0)
-
-
-def velocity_gains(runs: Sequence[Run]) -> list[tuple[Array, Array]]:
-    """Return the gains V and H of all accepted turns."""
-    return [velocity_gain(run, k) for run in runs for k, turn in enumerate(run.turns) if turn.accepted]
-
-
-def gain_rows(run: Run, k: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the rows of the half second before turn k and of that after it."""
-    n = round(GAIN_WINDOW_S / (BLOCK_NS * NS))
-    return np.flatnonzero(run.arrests[k])[-n:], np.flatnonzero(run.arrests[k + 1])[:n]
-
-
-def velocity_at_rest(run: Run, R: Array) -> tuple[Array, Array, Array]:
-    """Return times, velocities and H R of the bins at rest."""
-    at = np.concatenate(arrest_bins(run))
-    rows = run.rows[at]
+def _motion(run: Run, design: Design) -> tuple[Array, Array, Array, Array]:
+    """Return time, direction, velocity and columns of rows in motion, and of the vertical at rest."""
+    moving = np.flatnonzero(~run.at_rest)[::ROWS_PER_POINT]
+    still = np.flatnonzero(run.at_rest)[:: 5 * ROWS_PER_POINT]
+    arrest = run.arrests[:, still].argmax(axis=0)
+    v_n = run.rows["v_n"] + back_action(run)
+    of_motion, of_rest = design.of_rows(moving), design.at(run.t_s[still], arrest)
+    up = np.tile([0.0, 0.0, 1.0], (len(still), 1))
     return (
-        run.t_s[at].mean(axis=1),
-        run.v_n[at][..., :2].mean(axis=1),
-        (rows["H"][..., :2, :] @ R).mean(axis=1),
+        np.concatenate([np.repeat(run.t_s[moving], 3), run.t_s[still]]),
+        np.concatenate([np.tile(np.eye(3), (len(moving), 1)), up]),
+        np.concatenate([v_n[moving].ravel(), run.v_n[still, 2]]),
+        np.concatenate([of_motion.reshape(3 * len(moving), -1), of_rest[:, 2]]),
     )
 
 
-def run_result(run: Run, R: Array, t_s: Array, v_n: Array, fitted_n: Array) -> RunResult:
-    """Return the result of one run."""
-    H_rest = run.rows["H"][gain_rows(run, 0)[0], :2].mean(axis=0)
-    turns = []
-    for k, (turn, label) in enumerate(zip(run.turns, run.turn_labels, strict=True)):
-        V, H = velocity_gain(run, k)
-        turns.append(TurnResult(label, turn.accepted, V, H, V - H @ R))
-    return RunResult(
-        run.label,
-        tuple(turns),
-        float(np.abs(H_rest).max()),
-        t_s,
-        v_n[:, :2],
-        fitted_n[:, :2],
-    )
+def walk_covariance(t: Array, d: Array, noise: SensorNoise, gravity: float) -> Array:
+    """Return the covariance of the random walks at the times t along the directions d."""
+    s, u = np.minimum.outer(t, t), np.maximum.outer(t, t)
+    tilt = (gravity * noise.angle_walk) ** 2 * s * s * (3.0 * u - s) / 6.0
+    level = d[:, :2]
+    return np.asarray(noise.velocity_walk**2 * s * (d @ d.T) + tilt * (level @ level.T), np.float64)
 
 
-def singular_values_of(gains: Sequence[tuple[Array, Array]]) -> Array:
-    """Return the singular values of the stacked horizontal H, nine of them."""
-    s = np.zeros(9)
-    H = np.concatenate([h[:2] for _, h in gains])
-    s[: min(H.shape)] = np.linalg.svd(H, compute_uv=False)
-    return s
+class NormalEquations:
+    """Normal equations for R, the parameters, and the steps of all turns.
 
+    Parameters
+    ----------
+    parts : sequence of RunEquations
+        Each run.
+    parameters : Parameters
+        Their priors.
+    """
 
-def rank_reason(rank: int, sigma: Array, limit: float) -> str:
-    """Return the reason for the rank, in words."""
-    observable = (
-        f"rank {rank}: the observable directions have a sigma of at most {sigma[rank - 1] / MM:.3g} mm"
-    )
-    if rank == 9:
-        return observable
-    return f"{observable}, the next one {sigma[rank] / MM:.3g} mm; the limit is {limit / MM:g} mm"
+    def __init__(self, parts: Sequence[RunEquations], parameters: Parameters) -> None:
+        self.parts, self.parameters = parts, parameters
+        cut = 9 + len(parameters.names)
+        steps = 2 * sum(len(part.accepted) for part in parts)
+        accepted = [accepted for part in parts for accepted in part.accepted]
+        self.turns = np.flatnonzero(accepted)
+        """Numbers of the accepted turns."""
+        information = np.linalg.inv(parameters.covariance)
+        self.N = np.zeros((cut + steps, cut + steps))
+        self.b = np.zeros(cut + steps)
+        self.N[9:cut, 9:cut] = information
+        self.b[9:cut] = information @ parameters.expected
+        self._yy = float(parameters.expected @ self.b[9:cut]) + sum(float(part.v @ part.v) for part in parts)
+        for k, part in enumerate(parts):
+            at = self.columns_of(k)
+            self.N[np.ix_(at, at)] += part.A.T @ part.A
+            self.b[at] += part.A.T @ part.v
+        self._steps = np.arange(cut, cut + steps).reshape(-1, 2)
+        odd = self._steps[~np.array(accepted)].ravel()
+        self.N[odd, odd] += STEP_SIGMA**-2
+        self._scale = np.concatenate([np.full(9, 0.1), parameters.sigma, np.full(steps, 0.1)])
+        self._always = np.concatenate([np.arange(9, cut), odd])
 
+    def columns_of(self, k: int) -> NDArray[np.int64]:
+        """Return the columns of the unknowns of run k: R, shared, own, steps."""
+        shared = 9 + self.parameters.shared
+        size = (len(self.parameters.names) - self.parameters.shared) // len(self.parts)
+        own = shared + size * k + np.arange(size)
+        turns = [len(part.accepted) for part in self.parts]
+        steps = 9 + len(self.parameters.names) + 2 * sum(turns[:k]) + np.arange(2 * turns[k])
+        return np.concatenate([np.arange(shared), own, steps])
 
-def unobservable_text(sigma: Array, directions: Array, basis: Array, limit: float) -> str:
-    """Return the message for rotations that do not determine R; names the directions."""
-    wanted = basis.shape[1]
-    rank = min(wanted, int((sigma < limit).sum()))
-    inside = basis @ basis.T @ directions[:, sigma >= limit]
-    vectors, size, _ = np.linalg.svd(inside, full_matrices=False)
-    names = "; ".join(_direction(d) for d in vectors[:, size > 0.5].T)
-    return (
-        f"identification: expected rotations that determine {wanted} directions of the lever arms, "
-        f"got {rank}; unobservable to {limit / MM:g} mm: {names}; add rotations with another axis up"
-    )
+    def directions(self, free: Iterable[int] = ()) -> tuple[Array, Array]:
+        """Return 1-sigma of the principal directions of R, best first, and the directions as columns.
 
-
-def _direction(d: Array) -> str:
-    """Return a direction as text: '+0.71 x_Z -0.71 y_Z', components of r_x, r_y, r_z along body axes."""
-    terms = [f"{a}_{b}" for a in "xyz" for b in "XYZ"]
-    d = d * np.sign(d[np.argmax(np.abs(d))])
-    return " ".join(f"{value:+.2f} {term}" for value, term in zip(d, terms, strict=True) if abs(value) > 0.1)
-
-
-def require_runs(runs: Sequence[Run]) -> None:
-    """Raise `InputError` unless there is a run."""
-    if not runs:
-        raise InputError(
-            "identification: expected at least one accepted rotation, got none; see why they were rejected"
+        `free` are the numbers of accepted turns whose steps are free.
+        """
+        other = self._others(free)
+        scale = self._scale[other]
+        cross = self.N[other, :9] * scale[:, None]
+        information = self.N[:9, :9] - cross.T @ np.linalg.solve(
+            self.N[np.ix_(other, other)] * np.outer(scale, scale), cross
         )
+        values, vectors = np.linalg.eigh(0.5 * (information + information.T))
+        least = ROUNDING**2 * values[-1]
+        return 1.0 / np.sqrt(np.maximum(values[::-1], least)), vectors[:, ::-1]
 
+    def solve(self, basis: Array, free: Iterable[int] = ()) -> tuple[Array, Array]:
+        """Return estimate and covariance of all unknowns, R within the span of `basis`."""
+        n, other = len(self.b), self._others(free)
+        T = np.zeros((n, basis.shape[1] + len(other)))
+        T[:9, : basis.shape[1]] = basis
+        T[other, basis.shape[1] + np.arange(len(other))] = 1.0
+        T *= self._scale[:, None]
+        covariance = T @ np.linalg.inv(T.T @ self.N @ T) @ T.T
+        return covariance @ self.b, covariance
 
-def parameter_groups(priors: Priors, extra: Sequence[Extra]) -> tuple[str, ...]:
-    """Return the parameters beyond biases and matrices: skew, unless known to be none, and the extra ones."""
-    return (*(("skew",) if priors.skew else ()), *extra)
+    def chi_square(self, x: Array) -> float:
+        """Return chi-square of the residuals and the priors."""
+        return float(self._yy - 2.0 * self.b @ x + x @ self.N @ x)
+
+    def with_pivots(self, sigma: float) -> "NormalEquations":
+        """Return the equations with a shift of the origin of b in each run, 1-sigma in m."""
+        shared, runs = self.parameters.shared, len(self.parts)
+        own = (len(self.parameters.names) - shared) // runs
+        names, expected, blocks = list(self.parameters.names[:shared]), self.parameters.expected[:shared], []
+        covariance = self.parameters.covariance
+        blocks.append(covariance[:shared, :shared])
+        for k in range(runs):
+            at = slice(shared + own * k, shared + own * (k + 1))
+            names += [*self.parameters.names[at], *(f"pivot {k}_{axis}" for axis in "xyz")]
+            expected = np.concatenate([expected, self.parameters.expected[at], np.zeros(3)])
+            blocks += [covariance[at, at], sigma**2 * np.eye(3)]
+        cut = 9 + shared + own
+        shift = np.tile(np.eye(3), (3, 1))  # of the origin shifts all three points
+        parts = [
+            part._replace(A=np.column_stack([part.A[:, :cut], part.A[:, :9] @ shift, part.A[:, cut:]]))
+            for part in self.parts
+        ]
+        parameters = self.parameters._replace(
+            names=tuple(names), expected=expected, covariance=np.asarray(block_diag(*blocks), np.float64)
+        )
+        return NormalEquations(parts, parameters)
+
+    @property
+    def count(self) -> int:
+        """Number of equations beside the priors."""
+        return sum(len(part.v) for part in self.parts)
+
+    def _others(self, free: Iterable[int]) -> NDArray[np.int64]:
+        """Return the unknowns other than R."""
+        return np.concatenate([self._always, self._steps[list(free)].ravel()])

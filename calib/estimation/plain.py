@@ -1,33 +1,26 @@
 """Least-squares solution of V = H R, as in the literature."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
-from scipy.linalg import block_diag, solve_triangular
+from scipy.linalg import block_diag
 
-from calib.detection.noise import Noise
+from calib.estimation.design import Design
+from calib.estimation.gains import Fit, gain_rows, rest_growth, run_result, singular_values_of, velocity_gains
 from calib.estimation.linear_system import (
     ROUNDING,
-    Parameters,
-    arrest_bins,
-    bin_variance,
-    design_columns,
-    gain_rows,
-    noise_covariance,
-    parameter_groups,
+    NormalEquations,
+    extra_terms,
     prior_parameters,
-    rank_reason,
-    require_runs,
-    rest_noise,
-    rests_of,
-    run_result,
-    singular_values_of,
-    unobservable_text,
-    velocity_at_rest,
-    velocity_gains,
+    run_equations,
+    walk_covariance,
 )
-from calib.estimation.result import CENTROID_BASIS, LeverArmEstimate
-from calib.estimation.runs import Priors, Run
+from calib.estimation.noise import SensorNoise, noise_of
+from calib.estimation.observability import rank_reason, require_axes, require_runs, unobservable_text
+from calib.estimation.priors import Priors
+from calib.estimation.result import CENTROID_BASIS, TO_DIFFERENCES, ChiSquare, LeverArmEstimate
+from calib.estimation.runs import Run
 from imudrv.arrays import Array
 from imudrv.errors import InputError
 
@@ -58,18 +51,17 @@ def estimate_plain(runs: Sequence[Run], priors: Priors | None = None) -> LeverAr
     """
     priors = priors or Priors()
     require_runs(runs)
-    noise = rest_noise(runs)
-    terms = parameter_groups(priors, ())
-    parameters = prior_parameters(runs, priors, terms)
+    noise = noise_of(runs)
     gains = velocity_gains(runs)
     V = np.concatenate([v[:2] for v, _ in gains])
     H = np.concatenate([h[:2] for _, h in gains])
-    S = _plain_covariance(runs, noise, parameters, terms)
+    S = _plain_covariance(runs, noise, priors)
     sigma_v = float(np.sqrt(np.trace(S) / len(S)))
     s = singular_values_of(gains)
     sigma = sigma_v / np.maximum(s, ROUNDING * s[0])
     rank = int((sigma < priors.arm).sum())
     if rank < 6:
+        require_axes(runs)
         raise InputError(unobservable_text(sigma, np.linalg.svd(H)[2].T, CENTROID_BASIS, priors.arm))
     inverse = CENTROID_BASIS @ np.linalg.pinv(H @ CENTROID_BASIS)
     R = inverse @ V
@@ -86,47 +78,63 @@ def estimate_plain(runs: Sequence[Run], priors: Priors | None = None) -> LeverAr
         direction_sigma=sigma,
         singular_values=s,
         reason=rank_reason(rank, sigma, priors.arm),
-        chi_square=float((residual**2 / values[len(V) - freedom :]).sum()),
-        degrees_of_freedom=freedom,
+        scatter=None,
+        redundancy=ChiSquare(float((residual**2 / values[len(V) - freedom :]).sum()), freedom),
         noise=noise,
+        dither_error=_dither_error(runs, R, inverse, S),
         parameters=(),
         correlation=np.zeros((9, 0)),
         leave_one_out=(),
-        runs=tuple(run_result(run, R, *velocity_at_rest(run, R)) for run in runs),
+        runs=tuple(run_result(run, R, _fit(Design(run, ()), R)) for run in runs),
         notes=(),
     )
 
 
-def _plain_covariance(
-    runs: Sequence[Run], noise: Noise, parameters: Parameters, terms: Sequence[str]
-) -> Array:
+def _fit(design: Design, R: Array) -> Fit:
+    """Return the function of the velocity `H R`."""
+    return lambda t_s, arrest: np.asarray(design.at(t_s, arrest)[:, :, :9] @ R, np.float64)
+
+
+def _plain_covariance(runs: Sequence[Run], noise: SensorNoise, priors: Priors) -> Array:
     """Covariance of the stacked velocities of `velocity_gain`, from priors and noise.
 
     The alignment has chosen tilt and heading so that the rest before shows no acceleration: the remaining
     uncertainty is that of the priors given this rest.
     """
-    information = np.diag(
-        np.concatenate([np.full(9, 1e12), parameters.sigma**-2])
-    )  # R has no effect before the rotation
+    terms = extra_terms(priors, ())
+    designs = [Design(run, terms) for run in runs]
+    before = [
+        replace(run, readings=run.readings.take(np.flatnonzero(run.readings.arrest == 0))) for run in runs
+    ]
+    system = NormalEquations(
+        [run_equations(run, noise, "free", design) for run, design in zip(before, designs, strict=True)],
+        prior_parameters(runs, priors, terms),
+    )
+    cut = 9 + len(system.parameters.names)
     rows, blocks = [], []
-    for k, run in enumerate(runs):
-        at = parameters.columns_of(k, len(runs))
-        still = arrest_bins(run)[0]
-        columns = design_columns(run, terms)[:, :2]
-        A, t = columns[still].mean(axis=1), run.t_s[still].mean(axis=1)
-        single = [bin_variance(rest, noise) for rest in rests_of(run)]
-        K = noise_covariance(t, np.full(len(t), single[0]), noise, run.gravity)
-        white = solve_triangular(np.linalg.cholesky(K), A.reshape(len(t), -1), lower=True)
-        white = white.reshape(-1, A.shape[2])
-        information[np.ix_(at, at)] += white.T @ white
-        accepted = [j for j, turn in enumerate(run.turns) if turn.accepted]
-        windows = [(j + later, at) for j in accepted for later, at in enumerate(gain_rows(run, j))]
-        row = np.zeros((len(windows), 2, len(information)))
-        row[:, :, at] = [columns[rows_at].mean(axis=0) for _, rows_at in windows]
-        rows.append((row[1::2] - row[::2]).reshape(-1, row.shape[2]))
+    for k, (run, design) in enumerate(zip(runs, designs, strict=True)):
+        turns = [j for j, turn in enumerate(run.turns) if turn.accepted]
+        windows = [(j + later, at) for j in turns for later, at in enumerate(gain_rows(run, j))]
+        means = np.array(
+            [design.at(run.t_s[at], np.full(len(at), arrest))[:, :2].mean(axis=0) for arrest, at in windows]
+        )
+        row = np.zeros((len(turns), 2, len(system.b)))
+        row[:, :, system.columns_of(k)] = means[1::2] - means[::2]
+        rows.append(row.reshape(-1, len(system.b))[:, 9:cut])
         t = np.array([run.t_s[at].mean() for _, at in windows])
-        K = noise_covariance(t, np.array([single[j] for j, _ in windows]), noise, run.gravity)
+        K = walk_covariance(t, np.tile([1.0, 0.0, 0.0], (len(t), 1)), noise, run.gravity)
         gains = K[1::2, 1::2] - K[1::2, ::2] - K[::2, 1::2] + K[::2, ::2]
-        blocks.append(np.kron(gains, np.eye(2)))
+        pulses = np.kron(np.eye(len(turns)), 2.0 * run.readings.turn[:2, :2])
+        blocks.append(np.kron(gains, np.eye(2)) + pulses)
     stacked = np.concatenate(rows)
-    return np.asarray(block_diag(*blocks) + stacked @ np.linalg.solve(information, stacked.T), np.float64)
+    of_parameters = stacked @ np.linalg.solve(system.N[9:cut, 9:cut], stacked.T)
+    return np.asarray(block_diag(*blocks) + of_parameters, np.float64)
+
+
+def _dither_error(runs: Sequence[Run], R: Array, inverse: Array, S: Array) -> float:
+    """Return the largest error of a difference by the H that grows at rest, in its sigma."""
+    error = np.concatenate(
+        [turn.duration_s * rest_growth(run)[:2] @ R for run in runs for turn in run.turns if turn.accepted]
+    )
+    sigma = np.sqrt(np.diag(TO_DIFFERENCES @ inverse @ S @ inverse.T @ TO_DIFFERENCES.T))
+    return float(np.abs(TO_DIFFERENCES @ inverse @ error / sigma).max())

@@ -10,29 +10,37 @@ from scipy.spatial.transform import Rotation as Attitude
 
 from calib.axes import Side, vector
 from calib.detection.blocks import BLOCK_NS
-from calib.detection.noise import Noise
 from calib.detection.segments import Rest
 from calib.detection.turns import Turn
+from calib.estimation.design import Design, Known
+from calib.estimation.gains import GAIN_WINDOW_S
 from calib.estimation.linear_system import (
-    GAIN_WINDOW_S,
     NormalEquations,
-    parameter_groups,
+    extra_terms,
     prior_parameters,
     run_equations,
-    unobservable_text,
 )
+from calib.estimation.noise import SensorNoise
+from calib.estimation.observability import unobservable_text
+from calib.estimation.priors import Priors
+from calib.estimation.readings import RestSamples, read_rests
 from calib.estimation.result import CENTROID_BASIS, TO_DIFFERENCES
-from calib.estimation.runs import AFTER_S, BEFORE_S, GUARD_S, Priors, Run
+from calib.estimation.runs import AFTER_S, BEFORE_S, GUARD_S, Run
+from calib.estimation.walk import WalkEstimate
 from calib.html_table import html_table
 from imudrv.arrays import Array
 from imudrv.errors import InputError
-from imudrv.nav.alignment import ALIGNMENT_S, Aligned
+from imudrv.nav.alignment import ALIGNMENT_S, Aligned, RestReadings
 from imudrv.nav.earth import earth_rate_n, normal_gravity
 from imudrv.nav.mechanisation import Navigator, Place
 from imudrv.records import INCREMENTS
 from imudrv.units import DEG, MM, NS
 
 _PLAN_INTERVAL_NS: Final = 5_000_000
+
+
+TYPICAL_ARMS: Final = np.array([[24.0, -11.0, -9.0], [-23.0, 29.0, -7.0], [-1.0, -18.0, 16.0]]) * MM
+"""Sensing points of a unit that was not measured yet: misalignments are felt in proportion to them."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +101,7 @@ class Prediction:
 
 
 def predict(
-    plan: Sequence[PlannedRotation], latitude_rad: float, noise: Noise, priors: Priors | None = None
+    plan: Sequence[PlannedRotation], latitude_rad: float, noise: SensorNoise, priors: Priors | None = None
 ) -> Prediction:
     """Predict the covariance of the lever arms from an ideal motion, without data.
 
@@ -103,7 +111,7 @@ def predict(
         The rotations.
     latitude_rad : float
         Geodetic latitude.
-    noise : Noise
+    noise : SensorNoise
         Noise of the sensors, such as that of an earlier session.
     priors : Priors, optional
         Uncertainty of the static calibration.
@@ -120,11 +128,12 @@ def predict(
     priors = priors or Priors()
     if not plan:
         raise InputError("plan: expected at least one rotation, got none")
-    runs = [_planned_run(planned, k, latitude_rad, priors) for k, planned in enumerate(plan)]
-    terms = parameter_groups(priors, ())
-    system = NormalEquations(
-        [run_equations(run, noise, "free", terms) for run in runs], prior_parameters(runs, priors, terms)
-    )
+    runs = [
+        _planned_run(planned, k, latitude_rad, priors, noise.velocity_walk) for k, planned in enumerate(plan)
+    ]
+    terms = extra_terms(priors, ())
+    equations = [run_equations(run, noise, "free", Design(run, terms, _known(run))) for run in runs]
+    system = NormalEquations(equations, prior_parameters(runs, priors, terms))
     sigma, directions = system.directions()
     if int((sigma < priors.arm).sum()) < 6:
         raise InputError(unobservable_text(sigma, directions, CENTROID_BASIS, priors.arm))
@@ -133,7 +142,12 @@ def predict(
     return Prediction(covariance, spread.reshape(2, 3))
 
 
-def _planned_run(planned: PlannedRotation, k: int, latitude_rad: float, priors: Priors) -> Run:
+def _known(run: Run) -> Known:
+    R = TYPICAL_ARMS.ravel()
+    return Known(R, run.rows["H"] @ R)
+
+
+def _planned_run(planned: PlannedRotation, k: int, latitude_rad: float, priors: Priors, walk: float) -> Run:
     """Return the ideal run of a planned rotation: level, about the vertical, without errors."""
     T, n = _PLAN_INTERVAL_NS * NS, round(planned.duration_s / (_PLAN_INTERVAL_NS * NS))
     before, after = round(BEFORE_S / T), round(min(planned.after_s, AFTER_S) / T)
@@ -164,7 +178,9 @@ def _planned_run(planned: PlannedRotation, k: int, latitude_rad: float, priors: 
     increments["dv_b"] = gravity * T * up_b + C_nb[1:].inv().apply(np.diff(v_n, axis=0))
     q_nb = np.roll(C_nb0.as_quat(), 1)
     every = BLOCK_NS // _PLAN_INTERVAL_NS
-    rows = Navigator(Place(latitude_rad, 0.0, 0.0), q_nb, C_ba=np.eye(3), every=every).feed(increments)
+    navigated = Navigator(Place(latitude_rad, 0.0, 0.0), q_nb, C_ba=np.eye(3)).feed(increments)
+    navigated["v_n"] += navigated["H"] @ TYPICAL_ARMS.ravel()
+    rows = navigated[every - 1 :: every]
     guard = round(GUARD_S / T)
     level = priors.accelerometer_bias / gravity
     heading = hypot(
@@ -191,16 +207,28 @@ def _planned_run(planned: PlannedRotation, k: int, latitude_rad: float, priors: 
         )
         for start in starts.tolist()
     )
-    counter = rows["counter"]
-    begins = [0, *(turn.stop + guard for turn in turns)]
-    ends = [*(turn.start - guard for turn in turns), len(increments)]
+    counter, time = rows["counter"], (navigated["counter"] + 1) * T
+    begins = np.array([0, *(turn.stop for turn in turns)])
+    ends = np.array([*(turn.start for turn in turns), len(increments)])
+    rests = [
+        RestSamples(time[a:b], navigated["v_n"][a:b], increments["dv_b"][a:b], C_nb[b].as_matrix())
+        for a, b in zip(begins, ends, strict=True)
+    ]
+    inside = (begins + guard * (begins > 0))[:, None], (ends - guard * (ends < len(increments)))[:, None]
     return Run(
         f"plan#{k + 1}",
         turns,
         Aligned(0, 0, q_nb, ALIGNMENT_S, level, heading, None),
         gravity,
+        np.eye(3),
         rows,
         rows["v_n"],
-        (rows["counter"] + 1) * T,
-        np.array([(begin <= counter) & (counter < end) for begin, end in zip(begins, ends, strict=True)]),
+        (counter + 1) * T,
+        (inside[0] <= counter) & (counter < inside[1]),
+        read_rests(rests, np.eye(3), np.zeros(3), walk),
+        RestReadings(gravity, 0.0, *earth_rate_n(latitude_rad)[:0:-1], 0.0),
+        WalkEstimate(0.0, 0),
+        WalkEstimate(0.0, 0),
+        (),
+        "causal",
     )

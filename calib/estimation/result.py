@@ -1,27 +1,36 @@
 """Result of the estimation of the lever arms."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
+from scipy.special import chdtrc, chdtri, fdtrc, fdtri
 
-from calib.detection.noise import Noise
+from calib.estimation.dither_line import DitherLine
+from calib.estimation.noise import SensorNoise
 from calib.lever_arms.gauge import LeverArms
 from imudrv.arrays import Array
+from imudrv.imu.rate_filter import RateFilterName
+from imudrv.units import ARCSEC
 
 Extra = Literal["quadratic"]
 
 
-CHI_SQUARE_LIMIT: Final = 2.0
-"""Reduced chi-square above which the data contradict the model."""
+SCATTER_LIMIT: Final = 2.0
+"""Scatter over its degrees of freedom above which the rests were no rests."""
+
+
+CONTRADICTION_P: Final = 1e-4
+"""Probability of a larger chi-square below which the turns contradict each other."""
 
 
 OBSERVABLE_RATIO: Final = 0.5
 """A parameter is unobservable if its posterior sigma exceeds this fraction of its prior."""
 
 
-REST_H_LIMIT: Final = 2e-3
-"""Largest H at the end of a rest, m/s per m, of a unit without residual dither or vibration."""
+DITHER_LIMIT: Final = 0.1
+"""Largest error of a difference, in its sigma, that rectified dither or vibration may cause."""
 
 
 def _shift_free() -> Array:
@@ -35,6 +44,43 @@ CENTROID_BASIS: Final = _shift_free()
 
 TO_DIFFERENCES: Final = np.kron([[1.0, -1.0, 0.0], [1.0, 0.0, -1.0]], np.eye(3))
 """(6, 9): from (r_x, r_y, r_z) to (r_x - r_y, r_x - r_z)."""
+
+
+@dataclass(frozen=True)
+class ChiSquare:
+    """A chi-square test.
+
+    Attributes
+    ----------
+    value : float
+        Chi-square.
+    degrees_of_freedom : int
+        0: there is nothing to test.
+    noise_degrees_of_freedom : int or None
+        Those of the noise that it was divided by; None: that is known.
+    """
+
+    value: float
+    degrees_of_freedom: int
+    noise_degrees_of_freedom: int | None = None
+
+    @property
+    def band(self) -> tuple[float, float]:
+        """95 % band of the value."""
+        n, m = self.degrees_of_freedom, self.noise_degrees_of_freedom
+        if not n:
+            return 0.0, 0.0
+        if m:
+            return n * float(fdtri(n, m, 0.025)), n * float(fdtri(n, m, 0.975))
+        return float(chdtri(n, 0.975)), float(chdtri(n, 0.025))
+
+    @property
+    def p_value(self) -> float:
+        """Probability of a larger value."""
+        n, m = self.degrees_of_freedom, self.noise_degrees_of_freedom
+        if not n:
+            return 1.0
+        return float(fdtrc(n, m, self.value / n) if m else chdtrc(n, self.value))
 
 
 @dataclass(frozen=True)
@@ -98,6 +144,10 @@ class RunResult:
     H_rest : float
         Largest horizontal element of H at the end of the rest before the first turn, m/s per m: 0 in theory.
         The squared rates rectify residual dither or vibration in the gyros' increments, which makes it grow.
+    rate_filter : str
+        Filter of the rates of H.
+    lines : tuple of DitherLine
+        Dither in the angle increments.
     t_s : ndarray, shape (n,)
         Middle of each bin at rest, from the start of navigation.
     v_n, fitted_n : ndarray, shape (n, 2)
@@ -107,6 +157,8 @@ class RunResult:
     label: str
     turns: tuple[TurnResult, ...]
     H_rest: float
+    rate_filter: RateFilterName
+    lines: tuple[DitherLine, ...]
     t_s: Array
     v_n: Array
     fitted_n: Array
@@ -114,21 +166,25 @@ class RunResult:
 
 @dataclass(frozen=True)
 class LeaveOneOut:
-    """The estimate without one rotation.
+    """The estimate without one turn.
 
     Attributes
     ----------
     label : str
-        Label of the run left out.
+        Label of the turn left out.
     rank : int
         Number of directions that remain observable.
-    shift_m : ndarray, shape (3, 3), or None
-        R without it minus R with it; None: the other runs do not determine R.
+    shift_m, sigma_m : ndarray, shape (3, 3), or None
+        R without it minus R with it, and 1-sigma of that; None: the other turns do not determine R.
+    test : ChiSquare or None
+        Whether the turn agrees with the others.
     """
 
     label: str
     rank: int
     shift_m: Array | None
+    sigma_m: Array | None
+    test: ChiSquare | None
 
 
 @dataclass(frozen=True)
@@ -153,16 +209,20 @@ class LeverArmEstimate:
         Singular values of the stacked horizontal H after the rotations, m/s per m.
     reason : str
         Explanation of the rank.
-    chi_square, degrees_of_freedom : float, int
-        Of the whitened residuals and the priors; method `plain`: of V = H R.
-    noise : Noise
-        Noise of the sensors, from the rests.
+    scatter : ChiSquare or None
+        Whether the velocity within each rest is as the noise makes it; None: method `plain` does not test it.
+    redundancy : ChiSquare
+        Whether the turns agree on the arms.
+    noise : SensorNoise
+        Noise of the sensors, from the alignments.
+    dither_error : float
+        Largest error of a difference by dither or vibration that is left in the rates of H, in its sigma.
     parameters : tuple of ParameterEstimate
         All other parameters.
     correlation : ndarray, shape (9, n)
         Correlation of R with the parameters.
     leave_one_out : tuple of LeaveOneOut
-        The estimate without each rotation in turn.
+        The estimate without each turn.
     runs : tuple of RunResult
         Each run.
     notes : tuple of str
@@ -177,9 +237,10 @@ class LeverArmEstimate:
     direction_sigma: Array
     singular_values: Array
     reason: str
-    chi_square: float
-    degrees_of_freedom: int
-    noise: Noise
+    scatter: ChiSquare | None
+    redundancy: ChiSquare
+    noise: SensorNoise
+    dither_error: float
     parameters: tuple[ParameterEstimate, ...]
     correlation: Array
     leave_one_out: tuple[LeaveOneOut, ...]
@@ -195,6 +256,11 @@ class LeverArmEstimate:
     def turns(self) -> tuple[TurnResult, ...]:
         """The turns of all runs."""
         return tuple(turn for run in self.runs for turn in run.turns)
+
+    @property
+    def accepted(self) -> int:
+        """Number of accepted turns."""
+        return sum(turn.accepted for turn in self.turns)
 
     @property
     def sigma(self) -> Array:
@@ -221,27 +287,38 @@ class LeverArmEstimate:
         return sigma
 
     @property
-    def consistent(self) -> bool:
-        """Whether the model allows this chi-square; without degrees of freedom it always does."""
-        return self.chi_square <= CHI_SQUARE_LIMIT * self.degrees_of_freedom or not self.degrees_of_freedom
-
-    @property
     def refusals(self) -> tuple[str, ...]:
         """Reasons against a certificate from this result, with what to do; empty: none."""
         refusals = []
-        if not self.consistent:
+        scatter, redundancy = self.scatter, self.redundancy
+        if scatter is not None and scatter.value > SCATTER_LIMIT * scatter.degrees_of_freedom:
             refusals.append(
-                f"the velocities contradict the model: expected chi-square of about "
-                f"{self.degrees_of_freedom}, got {self.chi_square:.0f}; the report's figures show which "
-                "rotation deviates: leave it out, or look for what moved"
+                "the velocities within the rests contradict the noise of the alignments: expected chi-square "
+                f"of about {scatter.degrees_of_freedom}, got {scatter.value:.0f}; the report's figures show "
+                "where: look for what moved the bench, and record again"
             )
-        worst = max(self.runs, key=lambda run: run.H_rest)
-        if worst.H_rest > REST_H_LIMIT:
+        if redundancy.p_value < CONTRADICTION_P:
             refusals.append(
-                "the gyro increments carry dither or vibration: expected H of at most "
-                f"{REST_H_LIMIT:g} m/s per m at the end of the rest before the rotation, got "
-                f"{worst.H_rest:.2g} ({worst.label}); the squared rates rectify it and the arms come out "
-                "wrong: let the unit remove its dither from the increments, or stop what shakes the bench, "
-                "and record again"
+                "the turns contradict each other: expected chi-square of about "
+                f"{redundancy.degrees_of_freedom}, got {redundancy.value:.1f}, which chance gives once in "
+                f"{1.0 / max(redundancy.p_value, 1e-99):.2g}; the comparison without each turn shows which "
+                "one deviates: leave it out, or look for what moved"
             )
+        if self.dither_error > DITHER_LIMIT:
+            refusals.append(_dither_refusal(self.dither_error, self.runs))
         return tuple(refusals)
+
+
+def _dither_refusal(error: float, runs: Sequence[RunResult]) -> str:
+    worst = max(runs, key=lambda run: run.H_rest)
+    lines = ", ".join(
+        f"{line.amplitude_rad / ARCSEC:.3g} arcsec at {line.frequency_hz:.0f} Hz about {line.axis}"
+        for line in worst.lines
+    )
+    return (
+        f"the gyro increments carry dither or vibration ({lines or 'no single line'}) that the rate filter "
+        f"{worst.rate_filter} passes: H is {worst.H_rest:.2g} m/s per m at the end of the rest before the "
+        f"turn ({worst.label}), which costs {error:.2g} sigma, expected at most {DITHER_LIMIT:g}; let the "
+        "unit remove its dither from the increments, use the rate filter dither, or stop what shakes the "
+        "bench, and record again"
+    )

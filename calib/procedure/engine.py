@@ -20,10 +20,12 @@ within their limits.
 """
 
 from collections.abc import Mapping
+from math import hypot
 
+from calib.axes import vector
 from calib.detection.blocks import Block, BlockSplitter
 from calib.detection.tracking import MG, AttitudeTracker, StillnessDetector
-from calib.messages import message, verbatim
+from calib.messages import Message, message
 from calib.procedure.events import (
     Abort,
     Aborted,
@@ -136,18 +138,21 @@ class Engine:
         elif action.step_id == p.step.id:
             if not isinstance(action, Confirm):
                 self._skip()
+            elif self._is_rejected:
+                p.move_on()
+                self._follow(Outcome.AGAIN)
             elif self._has(Outcome.PLACED) and p.observation.ready:
                 self._follow(Outcome.PLACED)
         return self._new_events()
 
-    def reject(self, step_id: str, reason: str) -> tuple[Event, ...]:
+    def reject(self, step_id: str, reason: Message) -> tuple[Event, ...]:
         """Withdraw an accepted step, because its recording is not complete; it has to be done again.
 
         Parameters
         ----------
         step_id : str
             An accepted step.
-        reason : str
+        reason : Message
             For the operator.
 
         Returns
@@ -159,7 +164,7 @@ class Engine:
             p = self._progress
             del p.accepted[step_id]
             p.index = self._index(step_id)
-            self._follow(p.reject(verbatim(reason)))
+            self._follow(p.reject(reason))
         return self._new_events()
 
     @property
@@ -176,6 +181,11 @@ class Engine:
             headline=headline,
             hints=hints,
             reasons=p.reasons,
+            last_try=p.last_try,
+            accepted=tuple(self.accepted),
+            skipped=tuple(p.skipped),
+            C_nb=p.attitude.C_nb(vector(step.east)),
+            force_m_s2=None if p.attitude.force is None else hypot(*p.attitude.force),
             angle_deg=rotation.angle / DEG if state.turning else None,
             want_deg=float(p.turn_deg) if state.turning else None,
             rate_deg_per_s=(rotation.rate if state.turning else p.stillness.rate) / DEG,
@@ -258,8 +268,9 @@ class Engine:
         if not current and step_id not in p.accepted and step_id not in p.skipped:
             return
         p.accepted.pop(step_id, None)
-        p.skipped.discard(step_id)
-        p.index, p.reasons = index, ()
+        if step_id in p.skipped:
+            p.skipped.remove(step_id)
+        p.index, p.reasons, p.last_try = index, (), ()
         p.events.append(Redone(step_id, p.number + 1, p.counter))
         self._follow(Outcome.AGAIN)
 
@@ -267,10 +278,15 @@ class Engine:
         p = self._progress
         if not self._has(Outcome.NEXT_STEP) or p.step.id in p.accepted:
             return
-        p.skipped.add(p.step.id)
-        p.reasons = ()
+        p.skipped.append(p.step.id)
+        p.reasons = p.last_try = ()
         p.events.append(Skipped(p.step.id, p.number, p.counter))
         self._follow(p.advance())
+
+    @property
+    def _is_rejected(self) -> bool:
+        """Whether a rejection is shown."""
+        return self._phase is Phase.VERDICT and self._progress.step.id not in self._progress.accepted
 
     def _index(self, step_id: str) -> int:
         """Index of a step, -1 if there is none."""
@@ -284,9 +300,10 @@ class Engine:
         """Return the keys that have an effect now."""
         p, placing = self._progress, self._phase is Phase.PLACE
         effective = {
-            "confirm": placing and p.observation.ready,
+            "confirm": (placing and p.observation.ready) or self._is_rejected,
             "redo": self._has(Outcome.AGAIN) and not placing,
             "skip": self._has(Outcome.NEXT_STEP) and p.step.id not in p.accepted,
+            "back": self._has(Outcome.AGAIN) and bool(p.skipped),
             "abort": self._has(Outcome.ABORTED),
         }
         return tuple(name for name, has_effect in effective.items() if has_effect)

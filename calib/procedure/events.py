@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from calib.messages import Message
 from imudrv.arrays import Array
+from imudrv.vectors import Vector
 
 PREFLIGHT: Final = "preflight"
 """Step id of the events of the preflight."""
@@ -49,7 +50,10 @@ class Conditions(NamedTuple):
 
 @dataclass(frozen=True)
 class Confirm:
-    """The unit is in the pose of the step; counts in PLACE of that step, while the sensors agree."""
+    """The unit is in the pose of the step; counts in PLACE of that step, while the sensors agree.
+
+    After a rejection, it is read: the step is repeated.
+    """
 
     step_id: str
 
@@ -297,7 +301,15 @@ class View:
     hints : tuple of Message
         How to do it, and what is expected.
     reasons : tuple of Message
-        Why something was rejected or has started again.
+        Why something was rejected or has started again, the first one most important.
+    last_try : tuple of Message
+        Reasons of an earlier rejection of this step, while it is repeated.
+    accepted, skipped : tuple of str
+        Ids of the steps that are accepted, and of those that are skipped, in the order of skipping.
+    C_nb : tuple of 3 tuples of 3 float, or None
+        Attitude, body to east, north, up; before an alignment, with the heading of the pose. None: unknown.
+    force_m_s2 : float or None
+        Magnitude of the specific force, smoothed.
     angle_deg, want_deg : float or None
         Rotation about the vertical so far, and the required one, in ROTATE and REST.
     rate_deg_per_s : float
@@ -312,7 +324,7 @@ class View:
     level_sigma_deg, heading_sigma_deg : float or None
         1-sigma of the alignment, once it is known.
     actions : tuple of str
-        Keys that have an effect now: 'confirm', 'redo', 'skip', 'abort'.
+        Keys that have an effect now: 'confirm', 'redo', 'skip', 'back' to the step skipped last, 'abort'.
     bells : int
         Increases when a rotation is due, a step is done or an attempt is rejected.
     """
@@ -323,6 +335,11 @@ class View:
     headline: Message
     hints: tuple[Message, ...]
     reasons: tuple[Message, ...]
+    last_try: tuple[Message, ...]
+    accepted: tuple[str, ...]
+    skipped: tuple[str, ...]
+    C_nb: tuple[Vector, Vector, Vector] | None
+    force_m_s2: float | None
     angle_deg: float | None
     want_deg: float | None
     rate_deg_per_s: float

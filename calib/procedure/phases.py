@@ -11,16 +11,18 @@ from calib.detection.acceptance import rejection_reasons
 from calib.detection.blocks import BLOCK_NS, Block
 from calib.detection.segments import LEAST_FORCE, QUIET_S, SIGMAS, Rotation
 from calib.detection.tracking import MG, RestAverages
-from calib.estimation.linear_system import GAIN_WINDOW_S
-from calib.estimation.runs import GUARD_S, Priors
-from calib.messages import Message, message, verbatim
+from calib.estimation.gains import GAIN_WINDOW_S
+from calib.estimation.priors import Priors
+from calib.estimation.runs import GUARD_S
+from calib.messages import Message, message
 from calib.procedure import prompts
 from calib.procedure.attempt import Attempt
 from calib.procedure.events import PREFLIGHT, Accepted, Checked, Phase, Rejected, Turned
-from calib.procedure.preflight import PREFLIGHT_S, axis_faults, sensor_faults
+from calib.procedure.preflight import PREFLIGHT_S, axis_faults, dither_faults, sensor_faults
 from calib.procedure.progress import Progress
 from calib.procedure.prompts import MIN_ROTATION_RAD, READY_S, Prompt
 from calib.procedure.transitions import Outcome
+from imudrv.arrays import Array
 from imudrv.errors import InputError
 from imudrv.nav.alignment import MIN_ALIGNMENT_S, Alignment
 from imudrv.nav.earth import EARTH_RATE
@@ -81,6 +83,7 @@ class Preflight(PhaseState):
         super().__init__(progress, PREFLIGHT_S)
         self.step_id, self.number = PREFLIGHT, 1
         self._averages = RestAverages()
+        self._angles: list[Array] = []
         self._failed = False
 
     def prompt(self) -> Prompt:
@@ -95,9 +98,10 @@ class Preflight(PhaseState):
             self._failed = self._failed and not p.stillness.moving
             return None
         self._averages.feed(block)
+        self._angles.append(block.rows["dtheta_b"].copy())
         if p.elapsed_s < PREFLIGHT_S - _HALF_BLOCK_S:
             return None
-        averages = self._averages
+        averages, still = self._averages, self._angles
         rate_noise, force_noise = averages.noise()
         limits = motion_limits(rate_noise, force_noise)
         # motion too small to be detected before the noise was known
@@ -106,8 +110,10 @@ class Preflight(PhaseState):
             rate, force = limits[0] / DEG, limits[1] / MG
             p.reasons = (message("not_at_rest", rate_deg_per_s=rate, force_mg=force),)
             return None
+        kept = still[len(still) - round(p.elapsed_s / (BLOCK_NS * NS)) :]
         self._begin()
         p.reasons = sensor_faults(averages, p.status, p.procedure.limits, p.calibration)
+        p.reasons += dither_faults(np.concatenate(kept), round(p.interval_s / NS))
         p.reasons += axis_faults(averages, p.step, p.procedure.limits, p.site)
         if p.reasons:
             self._fail()
@@ -127,6 +133,7 @@ class Preflight(PhaseState):
 
     def _begin(self) -> None:
         self._averages, self.progress.elapsed_s = RestAverages(), 0.0
+        self._angles = []
 
     def _fail(self) -> None:
         """Report the faults, once until the unit is moved."""
@@ -144,16 +151,18 @@ class Placing(PhaseState):
     def __init__(self, progress: Progress) -> None:
         super().__init__(progress)
         progress.attempt = Attempt()
+        self._was_moved = False
 
     def feed(self, block: Block) -> Outcome | None:
         """Go on without a confirmation, where nobody is asked for one."""
         p = self.progress
+        self._was_moved = self._was_moved or p.stillness.moving
         ready = p.hands_free and p.observation.ready and p.elapsed_s >= READY_S
         return Outcome.PLACED if ready else None
 
     def prompt(self) -> Prompt:
         """Return what the operator has to do."""
-        return prompts.place(self.progress.observation, self.progress.hands_free)
+        return prompts.place(self.progress.observation, self.progress.hands_free, self._was_moved)
 
 
 class Settling(PhaseState):
@@ -196,7 +205,7 @@ class Aligning(PhaseState):
 
     def prompt(self) -> Prompt:
         """Return what the operator has to do."""
-        return Prompt(message("aligning"), (message("do_not_touch"),))
+        return Prompt(message("hands_off"), (message("do_not_touch"),))
 
     def feed(self, block: Block) -> Outcome | None:
         """Align."""
@@ -215,9 +224,10 @@ class Aligning(PhaseState):
         try:
             aligned = self._alignment.result()
         except InputError as error:
-            return p.restart(*faults, verbatim(str(error)))
+            return p.restart(*faults, message("alignment_failed", why=str(error)))
         if self._alignment.done and aligned.motion:
-            faults = (*faults, verbatim(aligned.motion))
+            moved = aligned.motion
+            faults = (*faults, message("moved_at_rest", begin_s=moved.begin_s, end_s=moved.end_s))
         attempt.aligned = aligned
         w, x, y, z = aligned.q_nb.tolist()
         p.attitude.q_nb = w, x, y, z
@@ -228,7 +238,7 @@ class Aligning(PhaseState):
         attempt.heading_rad = p.observation.clockwise or 0.0
         p.navigate((w, x, y, z))
         p.bells += 1
-        p.reasons = ()
+        p.reasons = p.last_try = ()
         return Outcome.ALIGNED
 
 
@@ -328,7 +338,7 @@ class Resting(PhaseState):
 
     def prompt(self) -> Prompt:
         """Return what the operator has to do."""
-        return Prompt(message("resting"), (message("do_not_touch"),))
+        return Prompt(message("hands_off"), (message("do_not_touch"),))
 
     def feed(self, block: Block) -> Outcome | None:
         """Judge the rotation after the rest, or ask for the next one."""
@@ -409,21 +419,27 @@ class Resting(PhaseState):
 
 
 class Verdict(PhaseState):
-    """The verdict is shown for some seconds, or until the unit moves."""
+    """The verdict is shown until the unit moves; some seconds at most, except a rejection to a person."""
 
     def feed(self, block: Block) -> Outcome | None:
         """Wait."""
         p = self.progress
-        if p.elapsed_s < VERDICT_S and not p.stillness.moving:
+        is_accepted = p.step.id in p.accepted
+        is_over = p.elapsed_s >= VERDICT_S and (is_accepted or p.hands_free)
+        if not is_over and not p.stillness.moving:
             return None
-        if p.step.id not in p.accepted:
-            return Outcome.AGAIN
-        return p.advance()
+        if is_accepted:
+            return p.advance()
+        p.move_on()
+        return Outcome.AGAIN
 
     def prompt(self) -> Prompt:
         """Return the verdict."""
         p = self.progress
-        return prompts.verdict(p.step, p.index + 1, len(p.procedure.steps), p.accepted.get(p.step.id))
+        accepted = p.accepted.get(p.step.id)
+        if accepted is None:
+            return prompts.rejection(p.step, p.procedure, p.reasons)
+        return prompts.verdict(p.index + 1, len(p.procedure.steps), accepted)
 
 
 class Done(PhaseState):

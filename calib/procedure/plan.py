@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Final
 
 from calib.axes import opposite, side
-from calib.detection.noise import Noise
+from calib.estimation.noise import SensorNoise
 from calib.estimation.predict import PlannedRotation, Prediction, predict
 from calib.procedure.preflight import PREFLIGHT_S
 from calib.procedure.schema import VERIFICATION, Pose, Procedure, Step
@@ -18,10 +18,8 @@ from imudrv.units import DEG_PER_SQRT_H, MM
 
 _FOLDER: Final = Path(__file__).parents[1] / "procedures"
 
-TYPICAL_NOISE: Final = Noise(
-    angle_walk=0.002 * DEG_PER_SQRT_H, velocity_walk=8e-5, velocity_white=6e-5, velocity_pulse=1.2e-4
-)
-"""Noise of a unit that was not measured yet; the beat of its pulses makes it quieter in some poses."""
+TYPICAL_NOISE: Final = SensorNoise(0.002 * DEG_PER_SQRT_H, velocity_walk=5e-5, degrees_of_freedom=0)
+"""Noise of a unit that was not measured yet."""
 
 
 HANDLING_S: Final = 15.0

@@ -16,6 +16,8 @@ import numpy as np
 
 from calib.axes import axis_name, side
 from calib.detection.tracking import MG, RestAverages
+from calib.estimation.dither_line import dither_lines
+from calib.estimation.low_pass import chosen_filter, weights
 from calib.messages import Message, message
 from calib.procedure.events import Conditions
 from calib.procedure.prompts import fault_message, lean_message, turn_message
@@ -25,7 +27,7 @@ from imudrv.calibration import Calibration
 from imudrv.nav.earth import EARTH_RATE, earth_rate_n
 from imudrv.records import Flag
 from imudrv.site import Site
-from imudrv.units import DEG, DEG_PER_H
+from imudrv.units import ARCSEC, DEG, DEG_PER_H, NS
 
 PREFLIGHT_S: Final = 30.0
 """Length of the rest that is examined, s."""
@@ -37,6 +39,11 @@ GRAVITY_TOLERANCE: Final = 0.02
 
 RATE_TOLERANCE: Final = 1.0 * DEG_PER_H
 """Tolerance of the mean rate, rad/s: pulses and a slightly swaying bench, over half a minute."""
+
+
+MEAN_SQUARE_LIMIT: Final = 5e-5
+"""Largest mean square of a filtered rate at rest, 1/s^2: H takes that for the square of a rotation, and with
+lever arms of 50 mm a turn of 2.5 s is then off by 6 um/s, a tenth of the noise of a good accelerometer."""
 
 
 ANOTHER_POSE: Final = 30.0 * DEG
@@ -85,6 +92,46 @@ def sensor_faults(
     if noise > limit:
         reasons.append(message("accelerometer_noise", noise_mg=noise, limit_mg=limit))
     return tuple(reasons)
+
+
+def dither_faults(dtheta_b: Array, interval_ns: int) -> tuple[Message, ...]:
+    """Return whether the angle increments at rest carry dither or vibration that spoils the lever arms.
+
+    Parameters
+    ----------
+    dtheta_b : ndarray, shape (n, 3)
+        Angle increments at rest, rad.
+    interval_ns : int
+        Sample interval.
+
+    Returns
+    -------
+    tuple of Message
+        Empty if the filter of the rates leaves less than `MEAN_SQUARE_LIMIT`.
+    """
+    name, interval_s = chosen_filter("auto", interval_ns), interval_ns * NS
+    taps = weights(name, interval_ns)
+    left = np.stack([np.convolve(angle, taps, "valid") for angle in dtheta_b.T]) / interval_s
+    square = left.var(axis=1)
+    axis = int(square.argmax())
+    if square[axis] < MEAN_SQUARE_LIMIT:
+        return ()
+    rate, limit = float(np.sqrt(square[axis])) / DEG, float(np.sqrt(MEAN_SQUARE_LIMIT)) / DEG
+    for line in dither_lines(dtheta_b, interval_s):
+        if line.axis == "XYZ"[axis]:
+            arcsec, hz = line.amplitude_rad / ARCSEC, line.frequency_hz
+            return (
+                message(
+                    "dither_line",
+                    axis=line.axis,
+                    amplitude_arcsec=arcsec,
+                    frequency_hz=hz,
+                    filter=name,
+                    rate_deg_per_s=rate,
+                    limit_deg_per_s=limit,
+                ),
+            )
+    return (message("dither", axis="XYZ"[axis], rate_deg_per_s=rate, filter=name, limit_deg_per_s=limit),)
 
 
 def axis_faults(

@@ -34,14 +34,16 @@ class Progress:
         Of the current step.
     attempt : Attempt
         The current one.
-    skipped : set of str
-        Ids of skipped steps.
+    skipped : list of str
+        Ids of skipped steps, in the order of skipping.
     logs : list of NavigationLog
         Logs of the accepted runs.
     events : list of Event
         Events that were not handed out yet.
     reasons : tuple of Message
         Latest reasons of a rejection or a restart.
+    last_try : tuple of Message
+        Reasons of a rejection after it was read.
     bells : int
         See `View`.
     status : Conditions
@@ -63,10 +65,11 @@ class Progress:
     attempts: dict[str, int]
     index: int = 0
     attempt: Attempt = field(default_factory=Attempt)
-    skipped: set[str] = field(default_factory=set)
+    skipped: list[str] = field(default_factory=list)
     logs: list[NavigationLog] = field(default_factory=list)
     events: list[Event] = field(default_factory=list)
     reasons: tuple[Message, ...] = ()
+    last_try: tuple[Message, ...] = ()
     bells: int = 0
     status: Conditions = field(default_factory=Conditions)
     flags: int = 0
@@ -97,7 +100,7 @@ class Progress:
 
     def remaining(self) -> int | None:
         """Index of the first step that is neither accepted nor skipped."""
-        done = self.accepted.keys() | self.skipped
+        done = self.accepted.keys() | set(self.skipped)
         return next((k for k, step in enumerate(self.procedure.steps) if step.id not in done), None)
 
     def advance(self) -> Outcome:
@@ -107,6 +110,10 @@ class Progress:
             return Outcome.COMPLETED
         self.index = index
         return Outcome.NEXT_STEP
+
+    def move_on(self) -> None:
+        """Note that the reasons shown were read; what follows is another attempt."""
+        self.reasons, self.last_try = (), self.reasons
 
     def trouble(self, block: Block) -> Message | None:
         """Return why the samples of a block cannot be used."""
@@ -127,10 +134,11 @@ class Progress:
     def tell(self, *reasons: Message) -> None:
         """Show the operator what was wrong; the run continues."""
         self.bells += bool(reasons)
-        self.reasons = reasons
+        self.reasons, self.last_try = reasons, ()
 
     def restart(self, *reasons: Message) -> Outcome:
         """Report that the alignment has to start again."""
+        self.last_try = ()
         self.events.append(Restarted(self.step.id, self.number, reasons, self.counter))
         self.bells += 1
         self.reasons = reasons

@@ -8,7 +8,7 @@ from calib.axes import axis_name, opposite, side, vector
 from calib.detection.tracking import AttitudeTracker, RotationTracker, StillnessDetector
 from calib.messages import Message, message
 from calib.procedure.events import Accepted
-from calib.procedure.schema import ProcedureLimits, Step
+from calib.procedure.schema import Procedure, ProcedureLimits, Step
 from imudrv.records import Flag
 from imudrv.units import DEG
 
@@ -147,14 +147,24 @@ def preflight(observed: StepObservation, failed: bool) -> Prompt:
         return Prompt(message("set_down_side", side=side(observed.step.up)), (pose, *_motion(observed)))
     if failed:
         return Prompt(message("check_failed"), (pose, message("check_repeats")))
-    return Prompt(message("checking"), (pose,))
+    return Prompt(message("hands_off"), (pose,))
 
 
-def place(observed: StepObservation, hands_free: bool) -> Prompt:
-    """Prompt for placing the unit; `hands_free`: nobody is asked to confirm."""
+def place(observed: StepObservation, hands_free: bool, was_moved: bool) -> Prompt:
+    """Prompt for placing the unit.
+
+    Parameters
+    ----------
+    observed : StepObservation
+        Sensors against what the step requires.
+    hands_free : bool
+        Nobody is asked to confirm.
+    was_moved : bool
+        Whether the unit was moved since it is to be placed.
+    """
     step, pose = observed.step, pose_message(observed.step)
     if not observed.upright:
-        return Prompt(message("side_up", side=side(step.up)), (*_tip(observed), pose))
+        return Prompt(message("side_up", side=side(step.up)), (*_tip(observed, was_moved), pose))
     if not observed.placed:
         return _turn_to_heading(observed, observed.clockwise or 0.0)
     if observed.unfit:
@@ -168,7 +178,7 @@ def settle(observed: StepObservation) -> Prompt:
     """Prompt for the rest before the alignment."""
     if observed.unfit:
         return Prompt(message("wait_for_unit"), (observed.unfit,))
-    return Prompt(message("settling"), _motion(observed))
+    return Prompt(message("hands_off"), _motion(observed))
 
 
 def rotate(
@@ -200,10 +210,35 @@ def rotate(
     return Prompt(message("rotate", turn_deg=turn_deg), (instruction,))
 
 
-def verdict(step: Step, number: int, steps: int, accepted: Accepted | None) -> Prompt:
-    """Verdict on an attempt; None: it was rejected."""
-    if accepted is None:
-        return Prompt(message("rejected"), (pose_message(step),))
+def rejection(step: Step, procedure: Procedure, reasons: tuple[Message, ...]) -> Prompt:
+    """Prompt after a rejection: the remedy for the first reason."""
+    shortest_s, longest_s = procedure.turn_s
+    angle_deg = abs(step.turn_deg)
+    remedies = {
+        "wrong_direction": message("remedy_direction", turn=turn_message(step.turn_deg * DEG)),
+        "wrong_angle": message("remedy_angle", angle_deg=angle_deg),
+        "too_slow": message("remedy_time", shortest_s=shortest_s, longest_s=longest_s),
+        "too_slow_with_error": message("remedy_time", shortest_s=shortest_s, longest_s=longest_s),
+        "saturated": message("remedy_time", shortest_s=shortest_s, longest_s=longest_s),
+        "axis_tilted": message("remedy_axis", side=side(step.up)),
+        "wrong_vertical": message("remedy_axis", side=side(step.up)),
+        "left_pose": message("remedy_axis", side=side(step.up)),
+        "rest_interrupted": message("remedy_rest"),
+        "no_rest_before": message("remedy_rest"),
+        "no_rest_after": message("remedy_rest"),
+        "short_rest_before": message("remedy_rest"),
+        "short_rest_after": message("remedy_rest"),
+        "no_rotation": message("remedy_rest"),
+        "samples_lost": message("remedy_cable"),
+        "during_rotation": message("remedy_cable"),
+        "recording_lacks": message("remedy_computer"),
+    }
+    first = reasons[0].key if reasons else ""
+    return Prompt(message("rejected"), (remedies.get(first, message("remedy_again")),))
+
+
+def verdict(number: int, steps: int, accepted: Accepted) -> Prompt:
+    """Verdict on an accepted attempt."""
     if accepted.turns > 1:
         hint = message("accepted_turns", turns=accepted.turns, within=accepted.turns_within_limits)
     else:
@@ -242,8 +277,8 @@ def _off_axis(observed: StepObservation, rotation: RotationTracker) -> Message:
     )
 
 
-def _tip(observed: StepObservation) -> tuple[Message, ...]:
-    """Return how to tip the unit so that the right side comes up."""
+def _tip(observed: StepObservation, was_moved: bool) -> tuple[Message, ...]:
+    """Return how to tip the unit so that the right side comes up; reversed axes are suspected after that."""
     wanted, now, attitude = observed.step.up, observed.attitude.up, observed.attitude
     if now == wanted:
         return (lean_message(attitude.lean(vector(wanted)), observed.step, observed.limits),)
@@ -262,7 +297,7 @@ def _tip(observed: StepObservation) -> tuple[Message, ...]:
                 "roll_toward", now=side(now), wanted=side(wanted), down=side(down), compass=compass
             )
         cause = message("accelerometers_exchanged", first=now[1], second=wanted[1])
-    if observed.stillness.quiet_s < _LONG_S:
+    if not was_moved or observed.stillness.quiet_s < _LONG_S:
         return (hint,)
     return hint, message("suspect", side=side(wanted), cause=cause)
 

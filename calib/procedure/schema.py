@@ -3,13 +3,17 @@
 A file lists poses; `Procedure.steps` are its runs in order, each with one alignment. A pose with `repeats`
 gives several; one with `turns` gives one run of several rotations with a rest, the *arrest*, after each. The
 id of a step never changes, so that a journal, a key and a recording can name it.
+
 `calib.procedure.plan.predicted` gives the accuracy of a plan in advance, and refuses one from which the six
 differences are not observable.
+
+A procedure of the sensors, or of the noise, has rests instead of runs: `Procedure.rests`, one in each pose
+and, with `turn_deg`, another one after a turn in place.
 """
 
 from collections import Counter
-from dataclasses import dataclass
-from typing import Annotated, Final, Literal, Self
+from dataclasses import dataclass, replace
+from typing import Annotated, Final, Literal, Self, TypeAlias
 
 import numpy as np
 from pydantic import Field as Key
@@ -23,6 +27,14 @@ from imudrv.nav.alignment import MAX_ALIGNMENT_S, MIN_ALIGNMENT_S
 
 LEAST_ARREST_S: Final = 1.0
 """Shortest rest that counts as one between two turns, s."""
+
+
+Kind: TypeAlias = Literal["arms", "sensors", "noise"]
+"""What a procedure determines."""
+
+
+_OF_ARMS: Final = frozenset({"align_s", "repeats", "turns", "alternate"})
+"""Keys of a pose of the kind arms only."""
 
 
 VERIFICATION: Final = "verification"
@@ -48,7 +60,24 @@ class ProcedureLimits(Model):
     axis_tilt_deg: Annotated[float, Key(gt=0, le=20)] = 10.0
 
 
+RestTime = Annotated[float, Key(ge=2, le=100_000)]
+REST_S: Final = {"arms": (2.0, 600.0), "sensors": (20.0, 3600.0), "noise": (20.0, 100_000.0)}
+"""Shortest and longest rest of each kind of procedure, s."""
 TurnTime = Annotated[float, Key(ge=0.5, le=60)]
+
+
+def _given(settings: Model) -> set[str]:
+    """Return the keys that are not at their defaults, which a file written from a model has too."""
+    fields = type(settings).model_fields
+    return {name for name, field in fields.items() if getattr(settings, name) != field.default}
+
+
+class PlannedTurn(Model):
+    """Motion of a turntable into a pose, right-handed about a body axis: never a measurement."""
+
+    about: Side
+    deg: Annotated[float, Key(ge=-720, le=720)]
+    seconds: Annotated[float, Key(ge=0.5, le=300)]
 
 
 class Pose(Model):
@@ -57,18 +86,20 @@ class Pose(Model):
     `turn_deg` is right-handed about the vertical: +180 is counter-clockwise, seen from above. Each
     rotation reverses the heading, so that a repeat begins where the rotation before it ended. `turns`: number
     of rotations after one alignment, `alternate`: every second one is back. `align_s` and `rest_s` are those
-    of the procedure where they are absent.
+    of the procedure where they are absent. Only a pose of the kind arms needs a `turn_deg`; in one of the
+    kind sensors it is a turn in place, with another rest after it, and `turn` is how a turntable comes there.
     """
 
     id: Annotated[str, Key(pattern=r"^[a-z0-9]+(-[a-z0-9]+)*$", max_length=40)]
     up: Side
     east: Side
-    turn_deg: Literal[180, -180]
+    turn_deg: Literal[180, -180] | None = None
     align_s: Annotated[float, Key(ge=MIN_ALIGNMENT_S, le=MAX_ALIGNMENT_S)] | None = None
-    rest_s: Annotated[float, Key(ge=2, le=600)] | None = None
+    rest_s: RestTime | None = None
     repeats: Annotated[int, Key(ge=1, le=20)] = 1
     turns: Annotated[int, Key(ge=1, le=20)] = 1
     alternate: bool = True
+    turn: PlannedTurn | None = None
 
     @model_validator(mode="after")
     def _turns_or_repeats(self) -> Self:
@@ -124,37 +155,63 @@ class Step:
     @property
     def C_bn(self) -> Array:
         """East, north and up of the pose as columns in body axes, shape (3, 3)."""
-        up, east = vector(self.up), vector(self.east)
-        return np.stack([east, np.cross(up, east), up], axis=1)
+        return _C_bn(self.up, self.east)
+
+
+@dataclass(frozen=True)
+class PlannedRest:
+    """One rest of a procedure of the sensors or of the noise.
+
+    Attributes
+    ----------
+    id : str
+        Id of the pose; of the rest after the turn in place ``ID-turned``.
+    up, east : str
+        Body axes that point up and about east.
+    rest_s : float
+        Its length.
+    turn : PlannedTurn or None
+        How a turntable comes there.
+    """
+
+    id: str
+    up: Side
+    east: Side
+    rest_s: float
+    turn: PlannedTurn | None = None
+
+    @property
+    def C_bn(self) -> Array:
+        """East, north and up of the pose as columns in body axes, shape (3, 3)."""
+        return _C_bn(self.up, self.east)
+
+
+def _C_bn(up: Side, east: Side) -> Array:
+    z, x = vector(up), vector(east)
+    return np.stack([x, np.cross(z, x), z], axis=1)
 
 
 class Procedure(Model):
     """A procedure file.
 
-    `kind`: what it determines; those of the sensors and of the noise are not run yet. `turn_s`: shortest and
+    `kind`: what it determines: the lever arms, the sensors or their noise. `turn_s`: shortest and
     longest duration of a rotation from rest to rest, for the operator and for the predicted accuracy.
     """
 
     format: Literal["imu50-procedure"]
     version: Literal[1, 2]
     name: Annotated[str, Key(min_length=1, max_length=80)]
-    kind: Literal["arms"] = "arms"
+    kind: Kind = "arms"
     align_s: Annotated[float, Key(ge=MIN_ALIGNMENT_S, le=MAX_ALIGNMENT_S)] = 370.0
-    rest_s: Annotated[float, Key(ge=2, le=600)] = 15.0
+    rest_s: RestTime = 15.0
     turn_s: tuple[TurnTime, TurnTime] = (2.0, 3.0)
     limits: ProcedureLimits = ProcedureLimits()
     poses: Annotated[tuple[Pose, ...], Key(min_length=1, max_length=100)]
 
-    @classmethod
-    def advice_for_value(cls, path: str, value: object) -> str:
-        """Return why another kind of procedure is refused."""
-        known = path == "kind" and value in ("sensors", "noise")
-        return f"this version does not run procedures of kind {value}" if known else ""
-
     @model_validator(mode="after")
     def _keys_of_the_version(self) -> Self:
-        given = self.model_fields_set.union(*(pose.model_fields_set for pose in self.poses))
-        newer = sorted(given & {"kind", "turn_s", "turns", "alternate"})
+        given = _given(self).union(*map(_given, self.poses))
+        newer = sorted(given & {"kind", "turn_s", "turns", "alternate", "turn"})
         if self.version == 1 and newer:
             raise ValueError(f"expected no {', '.join(newer)} in version 1, got one; write version: 2")
         return self
@@ -166,21 +223,45 @@ class Procedure(Model):
         return self
 
     @model_validator(mode="after")
+    def _poses_of_the_kind(self) -> Self:
+        least, most = REST_S[self.kind]
+        for pose in self.poses:
+            if not least <= (rest_s := pose.rest_s or self.rest_s) <= most:
+                raise ValueError(
+                    f"rest_s: expected {least:g} to {most:g} s in a procedure of kind {self.kind}, "
+                    f"got {rest_s:g}"
+                )
+            if self.kind == "arms" and pose.turn_deg is None:
+                raise ValueError(f"poses: {pose.id}: expected turn_deg, 180 or -180, got none")
+            if self.kind == "arms" and pose.turn is not None:
+                raise ValueError(f"poses: {pose.id}: expected turn in a procedure of kind sensors only")
+            if self.kind != "arms" and (alien := _given(pose) & _OF_ARMS):
+                raise ValueError(
+                    f"poses: {pose.id}: expected no {', '.join(sorted(alien))} in a procedure of kind "
+                    f"{self.kind}"
+                )
+        if self.kind == "noise" and len(self.rests) > 1:
+            raise ValueError(f"poses: expected one rest in a procedure of kind noise, got {len(self.rests)}")
+        return self
+
+    @model_validator(mode="after")
     def _each_id_once(self) -> Self:
-        counts = Counter(step.id for step in self.steps)
+        counts = Counter(step.id for step in self.steps or self.rests)
         if twice := [name for name, count in counts.items() if count > 1]:
             raise ValueError(f"poses: expected each id once, got {', '.join(twice)} again; rename them")
         return self
 
     @property
     def steps(self) -> tuple[Step, ...]:
-        """Runs in order."""
+        """Runs in order; none where the kind is another one than arms."""
+        if self.kind != "arms":
+            return ()
         return tuple(
             Step(
                 pose.id if pose.repeats == 1 else f"{pose.id}-{k + 1}",
                 pose.up,
                 opposite(pose.east) if k % 2 else pose.east,
-                pose.turn_deg,
+                pose.turn_deg or 180,
                 pose.align_s or self.align_s,
                 pose.rest_s or self.rest_s,
                 pose.turns,
@@ -189,6 +270,19 @@ class Procedure(Model):
             for pose in self.poses
             for k in range(pose.repeats)
         )
+
+    @property
+    def rests(self) -> tuple[PlannedRest, ...]:
+        """Rests in order; none where the kind is arms."""
+        if self.kind == "arms":
+            return ()
+        rests = []
+        for pose in self.poses:
+            first = PlannedRest(pose.id, pose.up, pose.east, pose.rest_s or self.rest_s, pose.turn)
+            rests.append(first)
+            if pose.turn_deg is not None:
+                rests.append(replace(first, id=f"{pose.id}-turned", east=opposite(pose.east), turn=None))
+        return tuple(rests)
 
     def rotation_limits(self, step: Step) -> acceptance.RotationLimits:
         """Return the limits of the rotations of a step, for `rejection_reasons` and `navigate_rotations`.

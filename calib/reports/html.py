@@ -1,5 +1,6 @@
 """Documents as one HTML file."""
 
+import re
 from base64 import b64encode
 from html import escape
 from importlib import resources
@@ -12,13 +13,17 @@ LONG: Final = 15
 """A table of more rows may be broken by a page's end."""
 
 
-def as_html(document: Document) -> str:
+def as_html(document: Document, number: str = "", watermark: str = "") -> str:
     """Return a document as one HTML file, figures inside, nothing loaded from elsewhere.
 
     Parameters
     ----------
     document : Document
         Its text is escaped here.
+    number : str
+        Number on every printed page.
+    watermark : str
+        Word across every printed page.
 
     Returns
     -------
@@ -30,7 +35,13 @@ def as_html(document: Document) -> str:
         for section in document.sections
     )
     page = Template(resources.files(__package__).joinpath("page.html").read_text("utf-8"))
-    return page.substitute(title=escape(document.title), subtitle=escape(document.subtitle), body=body)
+    return page.substitute(
+        title=escape(document.title),
+        subtitle=escape(document.subtitle),
+        number=re.sub("[^A-Za-z0-9._-]", "", number),
+        watermark=f'<div class="watermark">{escape(watermark)}</div>' if watermark else "",
+        body=body,
+    )
 
 
 def _marked_up(block: Block) -> str:

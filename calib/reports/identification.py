@@ -4,16 +4,17 @@ The report is a function of the result: it computes only means, extremes and oth
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import chain
 from math import hypot
 from typing import Final
 
 import numpy as np
-from scipy.special import chdtri
 
-from calib.estimation.result import LeverArmEstimate, ParameterEstimate, TurnResult
-from calib.estimation.runs import Priors, Run
+from calib.estimation.priors import Priors
+from calib.estimation.result import LeaveOneOut, LeverArmEstimate, ParameterEstimate, TurnResult
+from calib.estimation.runs import Run
 from calib.identification import CaptureSummary, IdentificationResult, scatter
 from calib.lever_arms.gauge import LeverArms
 from calib.messages import english
@@ -22,6 +23,7 @@ from calib.reports.document import Block, Document, Figure, KeyValues, Paragraph
 from calib.reports.format import counted, decimals, mm, three_digits
 from calib.reports.html import as_html
 from calib.reports.text import blocks_text
+from calib.reports.verdict import redundancy_mark, scatter_mark, verdict
 from imudrv.arrays import Array
 from imudrv.units import ARCSEC, DEG, DEG_PER_H, MM, PPM, STANDARD_GRAVITY, UG, URAD
 
@@ -55,6 +57,28 @@ def document(identification: IdentificationResult, arms: Sequence[LeverArms]) ->
     )
 
 
+def terminal_document(
+    identification: IdentificationResult, arms: Sequence[LeverArms], verbose: bool = False
+) -> Document:
+    """Return the result with the verdict at the end, as text that scrolls away is read.
+
+    Parameters
+    ----------
+    identification, arms
+        As for `document`.
+    verbose : bool
+        The other sections precede the result.
+
+    Returns
+    -------
+    Document
+    """
+    whole = document(identification, arms)
+    result, *others = whole.sections
+    marks, *tables = result.blocks
+    return replace(whole, sections=(*(others if verbose else ()), Section(result.title, (*tables, marks))))
+
+
 def report_html(identification: IdentificationResult, arms: Sequence[LeverArms]) -> str:
     """Return the report as one HTML file with its figures, see `document`."""
     return as_html(document(identification, arms))
@@ -67,7 +91,7 @@ def arms_text(arms: LeverArms) -> str:
 
 def _result(identification: IdentificationResult, arms: Sequence[LeverArms]) -> Iterator[Block]:
     result = identification.result
-    yield KeyValues(tuple(verdict(identification)))
+    yield KeyValues(tuple((mark, english(text)) for mark, text in verdict(identification)))
     yield Paragraph("u is the standard uncertainty (k = 1), U the expanded one (k = 2).")
     yield from map(_arms_table, arms)
     sigma = result.differences_sigma
@@ -110,90 +134,6 @@ def _arms_table(arms: LeverArms) -> Table:
             for i, r, row in zip("xyz", arms.r_b, sigma, strict=True)
         ),
     )
-
-
-def verdict(identification: IdentificationResult) -> Iterator[tuple[str, str]]:
-    """Evaluate an identification.
-
-    Parameters
-    ----------
-    identification : IdentificationResult
-        Result of the identification.
-
-    Yields
-    ------
-    (str, str)
-        'good', 'note', 'caution' or 'bad', and a sentence that gives the reason.
-    """
-    result = identification.result
-    worst = float(result.differences_sigma.max())
-    nine = result.gauge == "given"
-    yield (
-        "good",
-        f"{'All nine components' if nine else 'The six differences'} of the sensing points are determined by "
-        f"{counted(len(result.turns), 'rotation')}, method {result.method}; the largest standard uncertainty "
-        f"of a difference is {mm(worst, '.3f')} mm.",
-    )
-    if result.consistent:
-        yield _agreement(result)
-    for refusal in result.refusals:
-        yield "bad", f"{sanitise(refusal[0].upper() + refusal[1:])}. No certificate is made."
-    yield "note", _redundancy(result)
-    for n in result.parameters:
-        if n.name == "skew_s" and not n.observable:
-            yield (
-                "note",
-                "These rotations do not determine the gyro-accelerometer skew; the uncertainties include one "
-                f"of {n.prior * 1e3:g} ms (1 sigma).",
-            )
-    for k, run in enumerate(identification.runs):
-        if run.aligned.motion is not None:
-            yield "caution", f"Run {k + 1} moved during its alignment: {sanitise(run.aligned.motion)}."
-    for note in result.notes:
-        yield "caution", f"{sanitise(note)}."
-
-
-def _redundancy(result: LeverArmEstimate) -> str:
-    """Return how far the rotations check each other."""
-    shifts = [
-        (float(np.abs(one.shift_m).max()), one.label)
-        for one in result.leave_one_out
-        if one.shift_m is not None
-    ]
-    if not shifts:
-        return (
-            "The lever arms are determined but not checked: no rotation is redundant. A second set of "
-            "rotations in the opposite direction checks them."
-        )
-    shift, label = max(shifts, key=lambda item: item[0])
-    return (
-        f"Omitting one rotation changes no component by more than {mm(shift, '.3f')} mm ({sanitise(label)})."
-    )
-
-
-def _agreement(result: LeverArmEstimate) -> tuple[str, str]:
-    n = result.degrees_of_freedom
-    if n == 0:
-        return "caution", "As many equations as parameters: there are no residuals to test the model with."
-    low, high = float(chdtri(n, 0.975)), float(chdtri(n, 0.025))
-    interval = f"95 % interval {low:.1f} to {high:.1f}"
-    statistic = f"chi-square {result.chi_square:.1f} with {n} degrees of freedom, {interval}"
-    if not result.consistent:
-        return "bad", f"The velocities contradict the model: {statistic}."
-    if result.chi_square > high:
-        return (
-            "caution",
-            f"The residuals are larger than the noise explains: {statistic}. The uncertainties may be too "
-            f"small by a factor of {(result.chi_square / n) ** 0.5:.2f}.",
-        )
-    if result.chi_square < low:
-        return (
-            "note",
-            f"The residuals are smaller than expected: {statistic}. The uncertainties are conservative.",
-        )
-    if 2 * len(result.turns) <= 6:  # two equations per rotation for six differences: none checks the arms
-        return "good", f"The residuals at rest agree with the noise: {statistic}."
-    return "good", f"The velocities agree with the model: {statistic}."
 
 
 def _inputs(identification: IdentificationResult) -> Iterator[Block]:
@@ -268,7 +208,7 @@ def _rotation(run: Run) -> Iterator[tuple[str, str]]:
         "alignment",
         f"{aligned.duration_s:.1f} s: heading {aligned.heading_rad / DEG:.3f} deg, u "
         f"{aligned.heading_sigma_rad / DEG:.3f} deg; level u {aligned.level_sigma_rad / ARCSEC:.1f} arcsec; "
-        f"{sanitise(aligned.motion) if aligned.motion else 'no motion'}",
+        f"{sanitise(str(aligned.motion)) if aligned.motion else 'no motion'}",
     )
 
 
@@ -337,7 +277,7 @@ def _speed(v_n: Array) -> float:
 def _estimate(identification: IdentificationResult) -> Iterator[Block]:
     result = identification.result
     yield from _observability(result, identification.priors.arm)
-    yield Paragraph(f"Consistency. {_agreement(result)[1]}")
+    yield Paragraph(" ".join(map(english, (scatter_mark(result).text, redundancy_mark(result).text))))
     yield _noise(result)
     yield Table("Prior uncertainties", ("", "u"), tuple(priors_rows(identification.priors)))
     if result.parameters:
@@ -374,12 +314,12 @@ def _noise(result: LeverArmEstimate) -> KeyValues:
         (
             (
                 "gyros",
-                f"angle random walk {noise.angle_walk / DEG * 60.0:.5f} deg/sqrt(h), estimated in the rests",
+                f"angle random walk {noise.angle_walk / DEG * 60.0:.5f} deg/sqrt(h), from the alignments",
             ),
             (
                 "accelerometers",
-                f"horizontal: velocity random walk {noise.velocity_walk * 60.0:.5f} m/s/sqrt(h), white noise "
-                f"{mm(noise.velocity_white, '.4f')} mm/s, estimated in the rests",
+                f"horizontal: velocity random walk {noise.velocity_walk * 60.0:.5f} m/s/sqrt(h), from the "
+                "alignments",
             ),
         )
     )
@@ -387,21 +327,22 @@ def _noise(result: LeverArmEstimate) -> KeyValues:
 
 def _leave_one_out(result: LeverArmEstimate) -> Table:
     return Table(
-        "Largest change of r_x, r_y, r_z if one rotation is omitted, mm",
-        ("without", "rank", "r_x", "r_y", "r_z"),
-        tuple(
-            (
-                sanitise(one.label),
-                str(one.rank),
-                *(
-                    ("unobservable",) * 3
-                    if one.shift_m is None
-                    else (mm(np.abs(row).max(), ".3f") for row in one.shift_m)
-                ),
-            )
-            for one in result.leave_one_out
-        ),
+        "Largest change of r_x, r_y, r_z if one rotation is omitted, mm, and its u; p of its agreement",
+        ("without", "rank", "r_x", "u", "r_y", "u", "r_z", "u", "p"),
+        tuple((sanitise(one.label), str(one.rank), *_shifts(one)) for one in result.leave_one_out),
     )
+
+
+def _shifts(one: LeaveOneOut) -> Iterator[str]:
+    if one.shift_m is None or one.sigma_m is None or one.test is None:
+        yield from ("unobservable", "") * 3
+        yield ""
+        return
+    for shift, sigma in zip(np.abs(one.shift_m), one.sigma_m, strict=True):
+        at = int(shift.argmax())
+        yield mm(float(shift[at]), ".4f")
+        yield mm(float(sigma[at]), ".4f")
+    yield f"{one.test.p_value:.2g}"
 
 
 def _correlations(identification: IdentificationResult, names: Sequence[str]) -> Table:
@@ -447,23 +388,37 @@ def _limits(identification: IdentificationResult, arms: LeverArms) -> Iterator[s
 
 def priors_rows(priors: Priors) -> Iterator[tuple[str, str]]:
     """Return names and values of the priors, in the usual units."""
-    yield "accelerometer bias", f"{priors.accelerometer_bias / UG:g} ug"
-    yield "accelerometer scale", f"{priors.accelerometer_scale / PPM:g} ppm"
-    yield "accelerometer misalignment", f"{priors.accelerometer_misalignment / URAD:g} urad"
-    yield "gyro bias", f"{priors.gyro_bias / DEG_PER_H:g} deg/h"
-    yield "gyro scale", f"{priors.gyro_scale / PPM:g} ppm"
-    yield "gyro misalignment", f"{priors.gyro_misalignment / URAD:g} urad"
-    yield "gyro-accelerometer skew", f"{priors.skew * 1e3:g} ms"
+    if priors.covariance is not None:
+        yield "biases, scales, misalignments", "covariance of the certificate"
+    else:
+        yield "accelerometer bias", f"{priors.accelerometer_bias / UG:g} ug"
+        yield "accelerometer scale", f"{priors.accelerometer_scale / PPM:g} ppm"
+        yield "accelerometer misalignment", f"{priors.accelerometer_misalignment / URAD:g} urad"
+        yield "gyro bias", f"{priors.gyro_bias / DEG_PER_H:g} deg/h"
+        yield "gyro scale", f"{priors.gyro_scale / PPM:g} ppm"
+        yield "gyro misalignment", f"{priors.gyro_misalignment / URAD:g} urad"
+    yield "accelerometer bias from run to run", f"{priors.accelerometer_bias_of_run / UG:g} ug"
+    yield "gyro bias from run to run", f"{priors.gyro_bias_of_run / DEG_PER_H:g} deg/h"
+    skew = f"{priors.skew * 1e3:g} ms"
+    yield (
+        "gyro-accelerometer skew",
+        skew if not priors.expected_skew else f"{skew} about {priors.expected_skew * 1e3:g} ms",
+    )
 
 
 def _names(result: LeverArmEstimate) -> list[str]:
     """Return readable names of the parameters, with runs by number."""
-    runs = {f"phi {run.label}": f"run {k + 1}" for k, run in enumerate(result.runs)}
+    runs = {run.label: f"run {k + 1}" for k, run in enumerate(result.runs)}
     tilts = {"east": "tilt about east", "north": "tilt about north", "up": "heading"}
     names = []
     for parameter in result.parameters:
         head, _, part = parameter.name.rpartition("_")
-        names.append(f"{runs[head]} {tilts[part]}" if head in runs else parameter.name.replace("_", " "))
+        kind, _, label = head.partition(" ")
+        if label in runs:
+            kind = kind.replace("_", " ")
+            names.append(f"{runs[label]} {tilts[part] if kind == 'phi' else f'{kind} {part}'}")
+        else:
+            names.append(parameter.name.replace("_", " "))
     return names
 
 

@@ -16,6 +16,7 @@ from imudrv.calibration import Base64Of32Bytes
 from imudrv.errors import FaultyFileError, InputError
 from imudrv.files import settings_file
 from imudrv.files.atomic import sync_folder
+from imudrv.files.config_folder import config_file
 from imudrv.files.model import Model, UtcTime
 
 KEY_FILE: Final = "signing-key.yaml"
@@ -80,10 +81,7 @@ class TrustedKeys(Model):
 
 def key_path() -> Path | None:
     """Return the path of the bench's key, whether it exists or not; None for a user without a home."""
-    folder = os.environ.get("XDG_CONFIG_HOME", "")
-    if not os.path.isabs(folder):  # the standard ignores a relative one
-        folder = os.path.expanduser("~/.config")
-    return Path(folder) / "imu50" / KEY_FILE if os.path.isabs(folder) else None
+    return config_file(KEY_FILE)
 
 
 def bench_key() -> BenchKey | None:

@@ -31,7 +31,8 @@ import numpy as np
 from calib.detection.blocks import BLOCK_NS
 from calib.detection.noise import pooled_noise
 from calib.detection.segments import Segments, find_segments
-from calib.estimation.runs import GUARD_S, Priors
+from calib.estimation.priors import Priors
+from calib.estimation.runs import GUARD_S
 from calib.validation.skew import SkewCorrection
 from calib.validation.trial import BEFORE_S, FIRST_S, NavigatedVelocity, Trial, TrialSettings
 from imudrv.arrays import Array

@@ -28,6 +28,7 @@ from imudrv.sim import scenario as scenarios
 from imudrv.sim import truth
 from imudrv.sim.scenario import NOMINAL, Residuals, Rest, Scenario, Segment, Unit
 from imudrv.sim.unit import simulate
+from imudrv.wire.layout import Layout
 
 LAYOUT: Final = profiles.load("imu50-rs422").layout()
 """Layout of the simulated units."""
@@ -270,9 +271,9 @@ def _simulated_runs(name: str, unit: Unit, seed: list[int], known: Calibration) 
     return navigate_capture(lambda: pulses, LAYOUT, known, run.site, name, options).runs
 
 
-def simulated_pulses(run: Scenario) -> Iterator[Records]:
+def simulated_pulses(run: Scenario, layout: Layout = LAYOUT) -> Iterator[Records]:
     """Yield the pulses of a scenario, piece by piece."""
-    for chunk in simulate(run, LAYOUT):
+    for chunk in simulate(run, layout):
         chunk.pulses["flags"] = Flag.VALID
         yield chunk.pulses
 

@@ -6,6 +6,7 @@ from math import ceil
 from pathlib import Path
 from typing import Final
 
+from imudrv.bench import Bench
 from imudrv.calibration import Calibration
 from imudrv.errors import FaultyFileError, InputError
 from imudrv.files import settings_file
@@ -26,6 +27,7 @@ _KINDS: Final[dict[str, type[Model]]] = {
     "imu50-profile": Profile,
     "imu50-scenario": Scenario,
     "imu50-service": Settings,
+    "imu50-bench": Bench,
 }
 
 

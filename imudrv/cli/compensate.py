@@ -10,7 +10,7 @@ from imudrv.cli.capture import add_capture, open_capture, print_losses
 from imudrv.errors import InputError
 from imudrv.files.outputs import require_other
 from imudrv.files.tables import increment_columns, table
-from imudrv.imu.compensation import Compensator
+from imudrv.imu.compensation import LEAVES_OUT_SKEW, Compensator
 from imudrv.imu.rate_filter import NAMES
 from imudrv.terminal import progress, say
 
@@ -56,6 +56,8 @@ def run(arguments: argparse.Namespace) -> int:
     elif not compensator.has_size_effect:
         size_effect = f"not compensated: {capture.layout.name} lacks axes"
     say(f"  unit {calibration.serial_number}, {origin}", stream)
+    if compensator.leaves_out_skew:
+        say(f"  {LEAVES_OUT_SKEW}", stream)
     say(
         f"  size effect {size_effect}; rate filter {arguments.rate_filter}, delay {compensator.lag} samples",
         stream,

@@ -28,11 +28,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_profile(parser)
     add("--calibration", metavar="C.yaml", help="calibration file of the unit")
     add("--unit", metavar="SERIAL", help="serial number of the connected unit")
-    text = "udp://HOST:PORT, tcp://[HOST]:PORT, serial://PATH, can://..., file:NAME; may be repeated"
+    text = "udp://HOST:PORT, tcp://[HOST]:PORT, serial://PATH, can://..., zenoh://KEY, file:NAME; repeatable"
     add("--out", dest="outputs", action="append", metavar="URL", help=text)
     add("--record", metavar="FILE.mcap", help="record everything; in a folder: one file for each run")
     text = "have the disk keep the recording at least this often (default: when the system does, 5 to 30 s)"
     add("--sync", dest="sync_s", type=float, metavar="S", help=text)
+    text = "leave the recording as it was written, neither compressed nor indexed at the end of the run"
+    add("--no-pack", dest="pack", action="store_false", default=None, help=text)
     add("--rate-filter", choices=NAMES, help="angular rate for the size effect (default: causal)")
     add("--status", metavar="PATH", help="socket that reports the status")
     add("--realtime", action="store_true", default=None, help="request SCHED_FIFO and locked memory")

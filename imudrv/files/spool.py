@@ -68,6 +68,8 @@ class AppendThread:
     ----------
     displaced : str
         What has happened to the file, such as ``deleted``; empty while its name leads to it.
+    is_finished : bool
+        Whether the file is closed and complete.
 
     Raises
     ------
@@ -96,6 +98,7 @@ class AppendThread:
         self.sent = 0
         self._size = 0
         self._trouble = self.displaced = ""
+        self.is_finished = False
         self._sync_s = inf if sync_s is None else sync_s
         self._synced = self._looked = time.monotonic()
         if not self._append(head):
@@ -135,9 +138,9 @@ class AppendThread:
                 if more:
                     time.sleep(_PAUSE_S)
             self._look_after()
-        if not piece.data:
-            self._append(self._last_piece())
+        is_whole = not piece.data and self._append(self._last_piece())
         os.close(self._file)
+        self.is_finished = is_whole
 
     def _look_after(self) -> None:
         """Look for the file, and have the disk keep it, as often as either is due."""

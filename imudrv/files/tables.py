@@ -1,6 +1,6 @@
-"""Files of pulses and increments: `.csv`, `.npz`, or `.i50n` datagrams, by the suffix of the name.
+"""Files of pulses and increments by their suffix: `.csv`, `.npz`, `.parquet`, or `.i50n` datagrams.
 
-A file appears complete or not at all. All three are written piece by piece, so that a capture of any length
+A file appears complete or not at all. All are written piece by piece, so that a capture of any length
 needs little memory.
 """
 
@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import IO, Final, Protocol
+from typing import IO, Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,7 @@ Columns = Mapping[str, NDArray[np.generic]]
 _PULSES: Final = ("counter", "interval_ns", "gyro", "accelerometer", "temperature_degc", "status", "flags")
 _INCREMENTS: Final = ("counter", "interval_ns", "t_ns", "dtheta_b", "dv_b", "flags")
 _AXES: Final = ("x", "y", "z")
+_ROW_GROUP: Final = 1 << 16
 _STANDARD_OUTPUT: Final = 1  # its file descriptor
 
 
@@ -95,23 +96,66 @@ class CsvTable:
 
     def write(self, columns: Columns) -> None:
         """Append rows; the first call writes the header."""
-        names: list[str] = []
-        flat: list[list[object]] = []
-        for name, column in columns.items():
-            if column.ndim == 1:
-                names.append(name)
-                flat.append(column.tolist())
-            else:
-                names += [f"{name}_{part}" for part in self._parts.get(name, _AXES)]
-                flat += [part.tolist() for part in column.T]
+        flat = _flat(columns, self._parts)
         if not self._begun:
             self._begun = True
-            self._file.write((",".join(names) + "\n").encode())
-        text = "".join(",".join(map(repr, row)) + "\n" for row in zip(*flat, strict=True))
+            self._file.write((",".join(flat) + "\n").encode())
+        values = [column.tolist() for column in flat.values()]
+        text = "".join(",".join(map(repr, row)) + "\n" for row in zip(*values, strict=True))
         self._file.write(text.replace("nan", "").encode())  # numbers only: NaN is an absent one
 
     def finish(self) -> None:
         """Do nothing: all rows are written."""
+
+
+class ParquetTable:
+    """Table of Apache Parquet with the columns of `CsvTable`; needs the package pyarrow.
+
+    Parameters
+    ----------
+    file : binary file
+        Open for writing.
+    parts : mapping of str to sequence of str
+        See `CsvTable`.
+
+    Raises
+    ------
+    InputError
+        The package is absent.
+    """
+
+    def __init__(self, file: IO[bytes], parts: Mapping[str, Sequence[str]]) -> None:
+        try:
+            import pyarrow
+            import pyarrow.parquet
+        except ImportError as error:
+            raise InputError(".parquet: expected the package pyarrow: pip install imu50[parquet]") from error
+        self._arrow = pyarrow
+        self._file, self._parts = file, parts
+        self._writer: Any = None
+        self._pieces: list[Columns] = []
+        self._rows = 0
+
+    def write(self, columns: Columns) -> None:
+        """Append rows."""
+        self._pieces.append(_flat(columns, self._parts))
+        self._rows += len(next(iter(columns.values())))
+        if self._rows >= _ROW_GROUP:
+            self._write_group()
+
+    def finish(self) -> None:
+        """Write the last rows and the end of the file."""
+        self._write_group()
+        self._writer.close()
+
+    def _write_group(self) -> None:
+        group = self._arrow.table(
+            {name: np.concatenate([piece[name] for piece in self._pieces]) for name in self._pieces[0]}
+        )
+        if self._writer is None:
+            self._writer = self._arrow.parquet.ParquetWriter(self._file, group.schema)
+        self._writer.write_table(group)
+        self._pieces, self._rows = [_none_of(self._pieces[0])], 0
 
 
 class NpzTable:
@@ -180,6 +224,22 @@ class DatagramTable:
         """Do nothing: all rows are written."""
 
 
+def _flat(columns: Columns, parts: Mapping[str, Sequence[str]]) -> Columns:
+    """Return columns of numbers: a vector becomes one column for each of its parts."""
+    flat: dict[str, NDArray[np.generic]] = {}
+    for name, column in columns.items():
+        if column.ndim == 1:
+            flat[name] = column
+        else:
+            flat |= {f"{name}_{part}": column[:, k] for k, part in enumerate(parts.get(name, _AXES))}
+    return flat
+
+
+def _none_of(columns: Columns) -> Columns:
+    """Return the same columns without a row."""
+    return {name: column[:0] for name, column in columns.items()}
+
+
 @contextmanager
 def table(path: Path, kinds: Sequence[str], parts: Mapping[str, Sequence[str]]) -> Iterator[Table]:
     """Open a file for rows, of the kind of its suffix; it appears at the end, complete, or not at all.
@@ -212,6 +272,8 @@ def table(path: Path, kinds: Sequence[str], parts: Mapping[str, Sequence[str]]) 
         rows: Table
         if suffix == ".csv":
             rows = CsvTable(file, parts)
+        elif suffix == ".parquet":
+            rows = ParquetTable(file, parts)
         elif suffix == ".npz":
             rows = NpzTable(file, Path(file.name).parent, opened)
         else:

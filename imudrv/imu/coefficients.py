@@ -56,6 +56,12 @@ class Coefficients:
         Row i: sensing point of accelerometer i, m, body axes. None: no size-effect compensation.
     temperature : TemperatureTerms, optional
         None: no temperature compensation.
+    quadratic : ndarray, shape (3,)
+        Quadratic term of the accelerometers, s^2/m, on the sensing axes.
+    asymmetry : ndarray, shape (3,)
+        Relative difference of the accelerometers' scales of positive and negative input.
+    skew_s : float
+        Time by which the interval of the accelerometers ends later than that of the gyros.
     gyro_in_pulses, accelerometer_in_pulses : bool
         Whether the scales are of pulses; otherwise of increments in rad and m/s, about 1.
     """
@@ -68,5 +74,8 @@ class Coefficients:
     C_ba: Array
     r_b: Array | None = None
     temperature: TemperatureTerms | None = None
+    quadratic: Array = field(default_factory=_zeros)
+    asymmetry: Array = field(default_factory=_zeros)
+    skew_s: float = 0.0
     gyro_in_pulses: bool = True
     accelerometer_in_pulses: bool = True

@@ -1,10 +1,15 @@
 """From pulses to compensated increments in body axes (mathematics, section 1).
 
     dtheta_b = C_bg @ (k_g N_g) - b_g T
-    dv_b     = C_ba @ (N_a / K - b_a T - dv_r)
+    dv_b     = C_ba @ (dv_a - dv_r)
+    dv_a     = e - (k2 e^2 / T + |e| / 2 asymmetry) - skew (f_late - f_early)        e = N_a / K - b_a T
 
-Scale factors and biases follow the temperature. The size effect `dv_r` (`imudrv.imu.size_effect`) needs the
-angular rate at both ends of the interval, an FIR over the angle increments around them. Where the filter has
+Scale factors and biases follow the temperature; k2 is the quadratic term. With a positive skew, where the
+intervals of the accelerometers end later than those of the gyros, f_late is the mean force on the sensing
+axes over the interval itself and f_early that over the one before; with a negative one they are those of the
+one after and of the interval itself, which makes the output one sample later. Over any run the skew's part
+adds up to that of its two ends. The size effect `dv_r` (`imudrv.imu.size_effect`) needs the angular rate at
+both ends of the interval, an FIR over the angle increments around them. Where the filter has
 too few neighbours (the first samples, those beside a gap) a sample is output without size-effect
 compensation, its flag clear. A long interval, recovered from running totals, enters the filter as equal
 parts, one for each sample interval; as the tangential part of the size effect telescopes, their error does
@@ -25,12 +30,17 @@ from imudrv.imu.rate_filter import rate_filter as make_filter
 from imudrv.imu.size_effect import SIZE_EFFECT, SizeEffect, dv_r, size_effect_constants, unpack_size_effect
 from imudrv.kernels import kernel
 from imudrv.records import INCREMENTS, PULSES, Flag, Records
-from imudrv.units import NS
+from imudrv.units import MS, NS
 from imudrv.vectors import Matrix, Vector, add, matrix, put, rotate, row, scale, subtract, times, vector_at
 from imudrv.wire.layout import Layout
 
 MAX_TAPS: Final = 32
 """Longest rate filter."""
+
+LEAVES_OUT_SKEW: Final = (
+    "skew not compensated: a negative one needs a rate filter with a lag, centred or dither"
+)
+"""What to tell the user of `Compensator.leaves_out_skew`."""
 
 CONSTANTS: Final = np.dtype(
     [
@@ -42,6 +52,10 @@ CONSTANTS: Final = np.dtype(
         ("accelerometer_scale", np.float64, 3),  # pulses per m/s
         ("accelerometer_bias", np.float64, 3),  # m/s^2, sensing axes
         ("C_ba", np.float64, (3, 3)),
+        ("is_nonlinear", np.bool_),
+        ("quadratic", np.float64, 3),  # s^2/m
+        ("half_asymmetry", np.float64, 3),
+        ("skew_s", np.float64),  # 0: not compensated
         ("reference_degc", np.float64),
         ("low_degc", np.float64),  # above high_degc: no temperature compensation
         ("high_degc", np.float64),
@@ -69,6 +83,8 @@ CONSTANTS: Final = np.dtype(
 
 STATE: Final = np.dtype(
     [
+        ("force_known", np.bool_),
+        ("force", np.float64, 3),  # mean over the latest row, sensing axes, m/s^2
         ("parts", np.int64),  # sample intervals since the last gap
         ("head_end", np.int64),  # `parts` at the end of the first row that waits
         ("rate_known", np.bool_),
@@ -107,6 +123,14 @@ class Compensator:
     ----------
     has_size_effect : bool
         Whether there is a size effect to compensate.
+    leaves_out_skew : bool
+        Whether the certificate has a negative skew, which a filter without lag does not compensate.
+
+    Raises
+    ------
+    InputError
+        The calibration is of other numbers than the unit sends, see `require_sensors`, or its skew is longer
+        than a sample interval.
     """
 
     def __init__(
@@ -117,8 +141,13 @@ class Compensator:
         if gyro or len(accelerometer) == 3:
             coefficients = replace(coefficients, r_b=None)  # the size effect needs all angular rates
         self.has_size_effect = coefficients.r_b is not None
+        _require_short_skew(coefficients.skew_s, layout)
+        rates = make_filter(rate_filter, layout.interval_ns)
+        self.leaves_out_skew = coefficients.skew_s < 0.0 and rates.lag == 0
+        if self.leaves_out_skew or len(accelerometer) == 3:
+            coefficients = replace(coefficients, skew_s=0.0)
         self._samples_type = layout.samples_type
-        self._constants = _constants(coefficients, layout, make_filter(rate_filter, layout.interval_ns))
+        self._constants = _constants(coefficients, layout, rates)
         self._state = np.zeros(1, STATE)
         self._waiting = np.zeros(MAX_TAPS, INCREMENTS)
 
@@ -130,7 +159,9 @@ class Compensator:
     @property
     def lag(self) -> int:
         """Delay of the output, samples."""
-        return int(self._constants[0]["lag"]) if self.has_size_effect else 0
+        if self.has_size_effect:
+            return int(self._constants[0]["lag"])
+        return 1 if self._constants[0]["skew_s"] < 0.0 else 0
 
     def feed(self, pulses: Records) -> Records:
         """Compensate pulses.
@@ -156,7 +187,7 @@ class Compensator:
         Returns
         -------
         ndarray of INCREMENTS
-            Those that still waited for a rate, without size-effect compensation.
+            Those that still waited for a rate, without size-effect compensation, or for a force.
         """
         rest: Records = self._waiting[: self._state[0]["waiting"]].copy()
         _close(rest, self._constants)
@@ -192,6 +223,14 @@ def require_sensors(coefficients: Coefficients, layout: Layout) -> None:
             )
 
 
+def _require_short_skew(skew_s: float, layout: Layout) -> None:
+    if abs(skew_s) > layout.interval_ns * NS:
+        raise InputError(
+            f"skew_ms: expected at most a sample interval of {layout.name}, {layout.interval_ns / 1e6:g} ms, "
+            f"got {skew_s / MS:g} ms; use the certificate of the unit, or the right profile"
+        )
+
+
 def _constants(c: Coefficients, layout: Layout, rate_filter: RateFilter) -> Records:
     """Fill in the one row of `CONSTANTS`."""
     constants = np.zeros(1, CONSTANTS)
@@ -201,6 +240,8 @@ def _constants(c: Coefficients, layout: Layout, rate_filter: RateFilter) -> Reco
     k["gyro_scale"], k["gyro_bias"], k["C_bg"] = c.gyro_scale, c.gyro_bias, c.C_bg
     k["accelerometer_scale"], k["accelerometer_bias"] = c.accelerometer_scale, c.accelerometer_bias
     k["C_ba"] = c.C_ba
+    k["quadratic"], k["half_asymmetry"], k["skew_s"] = c.quadratic, 0.5 * c.asymmetry, c.skew_s
+    k["is_nonlinear"] = bool(np.any(c.quadratic) or np.any(c.asymmetry))
     k["low_degc"], k["high_degc"], k["channels"] = np.inf, -np.inf, -1
     if (t := c.temperature) is not None:
         k["reference_degc"], k["low_degc"], k["high_degc"] = t.reference_degc, t.low_degc, t.high_degc
@@ -278,11 +319,15 @@ def compensate(
         increments[k] = waiting[k]
     out = increments[: count + len(pulses)]
     _scale(pulses, out[count:], c)
+    if c["skew_s"] != 0.0:
+        _remove_skew(out, count, c["skew_s"], s)
     if c["has_size_effect"]:
         ready = _remove_size_effect(out, count, c, s)
     else:
-        _finish_plainly(out, matrix(c["C_ba"]))
         ready = len(out)
+        if c["skew_s"] < 0.0 and ready > 0:
+            ready -= 1  # waits for the force after it
+        _finish_plainly(out[:ready], matrix(c["C_ba"]))
     s["waiting"] = len(out) - ready
     for k in range(s["waiting"]):
         waiting[k] = out[ready + k]
@@ -339,12 +384,37 @@ def _scale(pulses: Records, out: Records, c: np.void) -> None:
             accelerometer = _present(accelerometer, c["lacks_accelerometer"])
         gyro, accelerometer = times(gyro, at.gyro_scale), times(accelerometer, at.accelerometer_scale)
         put(increment["dtheta_b"], 0, subtract(rotate(C_bg, gyro), scale(T, at.gyro_bias)))
-        put(increment["dv_b"], 0, subtract(accelerometer, scale(T, at.accelerometer_bias)))
+        e = subtract(accelerometer, scale(T, at.accelerometer_bias))
+        put(increment["dv_b"], 0, _linear(e, T, c) if c["is_nonlinear"] else e)
         increment["counter"], increment["t_ns"] = sample["counter"], sample["elapsed_ns"]
         if c["counter_step"] != 1:
             increment["counter"] //= c["counter_step"]
         increment["interval_ns"] = sample["interval_ns"]
         increment["flags"] = sample["flags"] if at.in_range else sample["flags"] | _TEMPERATURE_RANGE
+
+
+@kernel
+def _linear(e: Vector, T: float, c: np.void) -> Vector:
+    """Subtract the quadratic term and the asymmetry."""
+    square = scale(1.0 / T, times(vector_at(c["quadratic"], 0), times(e, e)))
+    size = times(vector_at(c["half_asymmetry"], 0), (abs(e[0]), abs(e[1]), abs(e[2])))
+    return subtract(subtract(e, square), size)
+
+
+@kernel
+def _remove_skew(out: Records, waiting: int, skew_s: float, s: np.void) -> None:
+    """Move velocities, sensing axes, to the intervals of the gyros; the first `waiting` are not new."""
+    known, force = s["force_known"], vector_at(s["force"], 0)
+    for i in range(waiting, len(out)):
+        new = out[i]
+        own = scale(1.0 / (new["interval_ns"] * NS), vector_at(new["dv_b"], 0))
+        if known and not new["flags"] & _MISSING_BEFORE:
+            change = scale(skew_s, subtract(own, force))
+            corrected = new if skew_s > 0.0 else out[i - 1]
+            put(corrected["dv_b"], 0, subtract(vector_at(corrected["dv_b"], 0), change))
+        known, force = True, own
+    s["force_known"] = known
+    put(s["force"], 0, force)
 
 
 @kernel

@@ -113,6 +113,35 @@ STATE: Final = np.dtype(
 """State that a call of the kernel leaves to the next, beside the blocks."""
 
 
+class RestMotion(NamedTuple):
+    """Motion of a unit that should have been at rest.
+
+    Parameters
+    ----------
+    begin_s, end_s : float
+        Interval with the largest deviation, since the start.
+    quantity, unit : str
+        ``rate``, rad/s, or ``specific force``, m/s^2.
+    rms, limit : float
+        Deviation from the median in that interval, and its limit.
+    """
+
+    begin_s: float
+    end_s: float
+    quantity: str
+    unit: str
+    rms: float
+    limit: float
+
+    def __str__(self) -> str:
+        """Return a sentence."""
+        return (
+            f"the unit moved {self.begin_s:.0f} to {self.end_s:.0f} s after the start: {self.quantity} "
+            f"{self.rms:.3g} {self.unit} rms off its median, limit {self.limit:.3g} {self.unit} "
+            f"({MOTION_RATIO:g} times the quietest fifth); align again, at rest"
+        )
+
+
 @dataclass(frozen=True)
 class Aligned:
     """Attitude at the end of an alignment.
@@ -127,7 +156,7 @@ class Aligned:
         Length of the window.
     level_sigma_rad, heading_sigma_rad : float
         Predicted 1-sigma error of each tilt, and of the heading.
-    motion : str or None
+    motion : RestMotion or None
         When and how much the unit moved; None: it was at rest.
     """
 
@@ -137,7 +166,7 @@ class Aligned:
     duration_s: float
     level_sigma_rad: float
     heading_sigma_rad: float
-    motion: str | None
+    motion: RestMotion | None
 
     @property
     def heading_rad(self) -> float:
@@ -453,8 +482,8 @@ def _filtered(v: Array, dt: Array, gravity: float, noise: _Noise) -> tuple[Array
     return x[1], x[2], covariance
 
 
-def _motion(blocks: Records) -> str | None:
-    """Describe the interval with the largest deviation, if it is much larger than in the quietest ones."""
+def _motion(blocks: Records) -> RestMotion | None:
+    """Return the interval with the largest deviation, if it is much larger than in the quietest ones."""
     n = len(blocks) // WINDOW_BLOCKS
     ends = np.cumsum(blocks["dt"])
     worst, found = 1.0, None
@@ -471,9 +500,5 @@ def _motion(blocks: Records) -> str | None:
             worst = float(rms[k]) / limit
             end = ends[(k + 1) * WINDOW_BLOCKS - 1]
             begin = end - blocks["dt"][k * WINDOW_BLOCKS : (k + 1) * WINDOW_BLOCKS].sum()
-            found = (
-                f"the unit moved {begin:.0f} to {end:.0f} s after the start: {what} {rms[k]:.3g} "
-                f"{unit_name} rms off its median, limit {limit:.3g} {unit_name} "
-                f"({MOTION_RATIO:g} times the quietest fifth); align again, at rest"
-            )
+            found = RestMotion(float(begin), float(end), what, unit_name, float(rms[k]), limit)
     return found

@@ -194,7 +194,7 @@ class Recording:
             elif isinstance(item, Recorded):
                 yield from self._reads(offset, item, timebase)
             elif isinstance(item, Message) and channels[item.channel_id].topic == CLOCK:
-                timebase = self._timebase(offset, item.data)
+                timebase = self.timebase(offset, item.data)
             elif isinstance(item, Message) and channels[item.channel_id].topic == WIRE:
                 encoding = channels[item.channel_id].message_encoding
                 yield from self._reads(offset, self._one(offset, item, encoding), timebase)
@@ -211,10 +211,14 @@ class Recording:
     def increments(self) -> Iterator[Records]:
         """Yield the published increments, ndarrays of INCREMENTS; counters modulo 2^32."""
         for offset, _, message in self._messages(INCREMENTS):
-            received = DatagramDecoder().feed(message.data)
-            if received.rejects.size or not received.increments.size:
-                raise self._corrupt(offset, "expected whole datagrams, got other bytes")
-            yield received.increments
+            yield self.increments_of(offset, message.data)
+
+    def increments_of(self, offset: int, data: bytes) -> Records:
+        """Return the increments of one message, ndarray of INCREMENTS; `offset` is for an error."""
+        received = DatagramDecoder().feed(data)
+        if received.rejects.size or not received.increments.size:
+            raise self._corrupt(offset, "expected whole datagrams, got other bytes")
+        return received.increments
 
     def statuses(self) -> Iterator[tuple[int, dict[str, Any]]]:
         """Yield host time, ns, and status of the service."""
@@ -256,7 +260,8 @@ class Recording:
             raise self._corrupt(offset, "expected a JSON object")
         return document
 
-    def _timebase(self, offset: int, data: bytes) -> Timebase:
+    def timebase(self, offset: int, data: bytes) -> Timebase:
+        """Return the timebase of one message; `offset` is for an error."""
         document = self._document(offset, data)
         values = map(document.get, Timebase._fields)
         times = [value for value in values if type(value) is int and abs(value) <= MAX_TIME_NS]

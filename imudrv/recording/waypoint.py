@@ -3,7 +3,8 @@
 Format: https://docs.novatel.com/Waypoint/Content/Data_Formats/IMR_File.htm, a header of 512 bytes, then 32
 bytes a sample: seconds of the week as a double and six scaled i32, gyro X Y Z in degrees and accelerometer
 X Y Z in m/s, here increments. Time is UTC, which the header says, and restarts with the week. The rounding
-error of one increment is added to the next, so that sums are right to one unit.
+error of one increment is added to the next, so that sums are right to one unit. Readers take each increment
+as that of one sample, so an interval that bridges a gap is split evenly into its samples.
 """
 
 from importlib.metadata import version
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from imudrv.errors import InputError
 from imudrv.files.atomic import atomic_write
-from imudrv.recording.reader import Recording
+from imudrv.recording.samples import Samples
 from imudrv.records import Records
 from imudrv.units import DEG, NS, NS_PER_S
 
@@ -46,17 +47,18 @@ _HEADER: Final = np.dtype(
 _SAMPLE: Final = np.dtype([("time", "<f8"), ("gyro", "<i4", 3), ("accelerometer", "<i4", 3)])
 _GYRO_DEG: Final = 2.0**-25  # 5.2e-10 rad; an increment may be up to 64 deg
 _ACCELEROMETER_M_S: Final = 2.0**-24  # 6.0e-8 m/s; up to 128 m/s
+_MOST_PARTS: Final = 1 << 22  # of the intervals of one message: 86 000 samples are one of 4.3 s at 20 kHz
 _WEEK_NS: Final = 7 * 86_400 * NS_PER_S
 _SUNDAY_NS: Final = 4 * 86_400 * NS_PER_S  # the epoch was a Thursday, weeks begin on Sunday
 
 
-def export_imr(recording: Recording, target: Path) -> None:
-    """Write the increments of a recording as IMR.
+def export_imr(samples: Samples, target: Path) -> None:
+    """Write increments as IMR.
 
     Parameters
     ----------
-    recording : Recording
-        The recording.
+    samples : Samples
+        The increments.
     target : Path
         The file.
 
@@ -65,16 +67,15 @@ def export_imr(recording: Recording, target: Path) -> None:
     InputError
         An increment that the format cannot hold, or the file cannot be written.
     """
-    unit = recording.origin.get("unit", "")
     header = np.zeros(1, _HEADER)
     header["szHeader"] = b"$IMURAW"
     header["dVersionNumber"] = 8.80
     header["bDeltaTheta"] = header["bDeltaVelocity"] = 1
-    header["dDataRateHz"] = recording.profile.rate_hz
+    header["dDataRateHz"] = NS_PER_S / samples.interval_ns
     header["dGyroScaleFactor"] = _GYRO_DEG
     header["dAccelScaleFactor"] = _ACCELEROMETER_M_S
     header["iUtcOrGpsTime"] = 1
-    header["szImuName"] = f"IMU50 {unit}".strip().encode("ascii", "replace")[:31]
+    header["szImuName"] = f"IMU50 {samples.unit}".strip().encode("ascii", "replace")[:31]
     header["szProgramName"] = f"imudrv {version('imu50')}".encode()[:31]
     gyro = _Rounding("angle", "deg", _GYRO_DEG)
     accelerometer = _Rounding("velocity", "m/s", _ACCELEROMETER_M_S)
@@ -83,12 +84,26 @@ def export_imr(recording: Recording, target: Path) -> None:
         np.errstate(over="ignore", invalid="ignore"),
     ):  # is checked as inf or NaN
         file.write(header.tobytes())
-        for increments in recording.increments():
-            samples = np.zeros(increments.size, _SAMPLE)
-            samples["time"] = ((increments["t_ns"] + _SUNDAY_NS) % _WEEK_NS) * NS
-            samples["gyro"] = gyro.feed(increments["dtheta_b"] / DEG, increments)
-            samples["accelerometer"] = accelerometer.feed(increments["dv_b"], increments)
-            file.write(samples.tobytes())
+        for increments in (_split(piece, samples.covered(piece), samples.path) for piece in samples):
+            rows = np.zeros(increments.size, _SAMPLE)
+            rows["time"] = ((increments["t_ns"] + _SUNDAY_NS) % _WEEK_NS) * NS
+            rows["gyro"] = gyro.feed(increments["dtheta_b"] / DEG, increments)
+            rows["accelerometer"] = accelerometer.feed(increments["dv_b"], increments)
+            file.write(rows.tobytes())
+
+
+def _split(increments: Records, covered: NDArray[np.int64], path: Path) -> Records:
+    """Split each interval evenly into the samples that it covers; the last one ends where it ended."""
+    if covered.sum() > _MOST_PARTS:
+        raise InputError(f"{path}: expected intervals of some samples, got one of {covered.max()} samples")
+    parts = np.repeat(increments, covered)
+    share = np.repeat(covered, covered)
+    after = np.repeat(np.cumsum(covered), covered) - 1 - np.arange(parts.size)  # parts of it that follow
+    parts["t_ns"] -= after * parts["interval_ns"] // share
+    parts["counter"] -= after
+    for name in ("dtheta_b", "dv_b"):
+        parts[name] /= share[:, np.newaxis]
+    return parts
 
 
 class _Rounding:

@@ -28,8 +28,11 @@ from imudrv import profiles, system
 from imudrv.calibration import coefficients
 from imudrv.chain import Chain, Output
 from imudrv.diagnosis import LineState
+from imudrv.errors import InputError
 from imudrv.hostclock import now_ns
+from imudrv.imu.compensation import LEAVES_OUT_SKEW
 from imudrv.ports import PortEndedError
+from imudrv.recording.pack import pack
 from imudrv.records import INCREMENTS, PULSES, Arrival, Source
 from imudrv.service.calibration_watch import CalibrationWatch
 from imudrv.service.clock_watch import ClockWatch
@@ -180,11 +183,29 @@ class Service:
                 self._manager.notify("READY=1")
                 sha256 = self._calibration.current.sha256
                 self._events.event(f"serving {self._settings.port}, calibration {sha256[:12]}")
+                if self._chain.leaves_out_skew:
+                    self._events.event(LEAVES_OUT_SKEW)
                 while not self._signals.stop and self.step():
                     pass
             finally:
                 self._manager.notify("STOPPING=1")
-                self.close()
+                recorded = self.close()
+        if recorded is not None and self._settings.pack and self._settings.record:
+            self._pack(recorded)
+
+    def _pack(self, path: Path) -> None:
+        """Pack the recording of this run; whatever ends it, the recording stays as it was written."""
+        before = path.stat().st_size
+        try:
+            pack(path, path)
+        except InputError as error:
+            self._events.failure(f"{path}: is complete, but could not be packed: {error}")
+        except KeyboardInterrupt:
+            self._events.failure(
+                f"{path}: is complete, but packing was interrupted; imudrv pack does it later"
+            )
+        else:
+            self._events.event(f"packed {path}: {path.stat().st_size} bytes, was {before}")
 
     def step(self) -> bool:
         """Read once, publish, and do the housekeeping if it is due.
@@ -215,14 +236,21 @@ class Service:
             self._next_poll_ns = now + (POLL_NS if is_behind else HOUSEKEEPING_NS)
         return True
 
-    def close(self) -> None:
-        """Publish the samples that are held back, and close everything; `run` does it."""
+    def close(self) -> Path | None:
+        """Publish the samples that are held back, and close everything; `run` does it.
+
+        Returns
+        -------
+        Path or None
+            The recording, if there is one and it is complete.
+        """
         self._publish(self._chain.close(), self._clock())
         self._port.close()
         self._events.event(f"end: {self._chain.tracker.counts}")
         self._publish_status(self._clock())
-        self._recordings.close()
+        recorded = self._recordings.close()
         self._open.close()
+        return recorded
 
     def stop(self) -> None:
         """End `run`, as SIGTERM does; for any thread."""

@@ -72,11 +72,16 @@ def view(status: Status) -> RenderableType:
     table = Table.grid(padding=(0, 2), expand=True)
     table.add_column(style="bold", no_wrap=True)
     table.add_column(ratio=1)
-    rows = _line_rows, _time_rows, _unit_rows, _output_rows, _sample_rows
-    for name, text, style in chain.from_iterable(section(status) for section in rows):
+    for name, text, style in rows(status):
         table.add_row(name, Text(text, style, overflow="ellipsis"))
     events = Text("\n".join(status.events[-3:]), "dim", overflow="ellipsis", no_wrap=True)
     return Group(health, table, events)
+
+
+def rows(status: Status) -> Iterator[Row]:
+    """Return the rows of a status."""
+    sections = _line_rows, _time_rows, _unit_rows, _output_rows, _sample_rows
+    return chain.from_iterable(section(status) for section in sections)
 
 
 def _line_rows(status: Status) -> Iterator[Row]:

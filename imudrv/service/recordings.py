@@ -144,13 +144,14 @@ class Recordings:
         self._displaced = f"{lost} was {before.displaced} while it was written; {now} continues it"
         return f"recording {self._displaced}"
 
-    def close(self) -> None:
-        """Close the current recording and cancel the requests."""
+    def close(self) -> Path | None:
+        """Close the current recording and cancel the requests; return its file if it is complete."""
         if self._recorder is not None:
             self._recorder.close()
         self._is_closed = True
         while self._requests:
             self._requests.popleft()[-1].cancel()
+        return None if self._recorder is None else self._recorder.finished
 
 
 def _in_background(close: Callable[[], object]) -> None:

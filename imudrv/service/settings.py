@@ -18,8 +18,9 @@ class Settings(Model):
 
     Paths in the file are relative to the folder in which the service is started. `unit`: serial number of the
     connected unit; a calibration of another one is refused. `record` may be a folder: each run then creates a
-    file named by its start time; `sync_s` has the disk keep it at least that often. `status`: the socket that
-    reports the status. `realtime` requests SCHED_FIFO and locked memory.
+    file named by its start time; `sync_s` has the disk keep it at least that often; `pack` compresses and
+    indexes it at the end of the run. `status`: the socket that reports the status. `realtime` requests
+    SCHED_FIFO and locked memory.
     """
 
     format: Literal["imu50-service"] = "imu50-service"
@@ -31,6 +32,7 @@ class Settings(Model):
     outputs: Annotated[tuple[Text, ...], Key(max_length=16)] = ()
     record: Text | None = None
     sync_s: Annotated[float, Key(gt=0, le=3600, allow_inf_nan=False)] | None = None
+    pack: bool = True
     rate_filter: RateFilterName = "causal"
     status: Text | None = None
     realtime: bool = False

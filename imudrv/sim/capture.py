@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from imudrv.records import Records
 from imudrv.sim.faults import MessageFaults, StreamFaults
 from imudrv.sim.scenario import Scenario
-from imudrv.sim.unit import TRUTH, simulate
+from imudrv.sim.unit import TRUTH, More, simulate
 from imudrv.wire.candump import format_candump
 from imudrv.wire.encode import CanEncoder, StreamEncoder
 from imudrv.wire.layout import Layout
@@ -36,7 +36,9 @@ class WireChunk(NamedTuple):
     truth: Records
 
 
-def wire(scenario: Scenario, layout: Layout, chunk: int = 65_536) -> Iterator[WireChunk]:
+def wire(
+    scenario: Scenario, layout: Layout, chunk: int = 65_536, more: More | None = None
+) -> Iterator[WireChunk]:
     """Simulate the wire data of a scenario, with its faults, for a profile.
 
     Parameters
@@ -47,13 +49,15 @@ def wire(scenario: Scenario, layout: Layout, chunk: int = 65_536) -> Iterator[Wi
         Layout of the profile.
     chunk : int
         Number of samples at a time; any value gives the same data.
+    more : callable, optional
+        See `imudrv.sim.unit.simulate`.
 
     Yields
     ------
     WireChunk
         Data of `chunk` samples.
     """
-    chunks = simulate(scenario, layout, chunk)
+    chunks = simulate(scenario, layout, chunk, more)
     if layout.can:
         messages, bus = CanEncoder(layout), MessageFaults(scenario.faults, scenario.seed)
         for part in chunks:

@@ -22,6 +22,7 @@ A motor adds its acceleration at the pivot; neglected is Coriolis' of its veloci
 **Dither** rotates the case by `d(t)`, small: `R = I + [d x]`. Neglected: d^2/2, 3e-11 for 1.5 arcsec.
 """
 
+from bisect import bisect_right
 from math import cos, pi, sin
 from typing import Final, NamedTuple
 
@@ -41,7 +42,7 @@ from imudrv.sim.path import (
     start_attitude,
     still,
 )
-from imudrv.sim.scenario import Scenario
+from imudrv.sim.scenario import OneMotion, Scenario
 from imudrv.vectors import Vector, add, cross, dot, row, scale
 
 _NO_END: Final = 2**62
@@ -113,17 +114,24 @@ class Motion:
         bandwidth_hz = _case_bandwidth(body.case) + body.motor.rate / (2.0 * pi)
         quadrature = Quadrature(body.interval_s, split_s, bandwidth_hz)
         self._is_shaken = bandwidth_hz > 0.0
-        C_nb = start_attitude(scenario.start)
-        self._segments = []
-        for number, motion in enumerate(scenario.motions):
-            rng = np.random.default_rng(np.random.SeedSequence(scenario.seed, spawn_key=(1, number)))
-            part = path_segment(motion, C_nb, quadrature, rng)
-            self._segments.append(part)
-            C_nb = C_nb @ rotation(part.axes_b[0], part.angle_rad)
-        self._ends = np.cumsum([s.intervals for s in self._segments])
-        self.samples = int(self._ends[-1])
-        self._before = still(_NO_END, self._segments[0].C_nb, quadrature)
-        self._after = still(_NO_END, C_nb, quadrature)
+        self._quadrature, self._seed = quadrature, scenario.seed
+        self._C_nb = start_attitude(scenario.start)
+        self._before = self._after = still(_NO_END, self._C_nb, quadrature)
+        self._segments: list[PathSegment] = []
+        self._ends: list[int] = []
+        self.samples = 0
+        for motion in scenario.motions:
+            self.append(motion)
+
+    def append(self, motion: OneMotion) -> None:
+        """Append a motion, before any of its intervals were asked for."""
+        rng = np.random.default_rng(np.random.SeedSequence(self._seed, spawn_key=(1, len(self._segments))))
+        part = path_segment(motion, self._C_nb, self._quadrature, rng)
+        self._C_nb = self._C_nb @ rotation(part.axes_b[0], part.angle_rad)
+        self._after = still(_NO_END, self._C_nb, self._quadrature)
+        self._segments.append(part)
+        self.samples += part.intervals
+        self._ends.append(self.samples)
 
     def integrals(self, first: int, stop: int) -> Integrals:
         """Return the integrals over the sample intervals `first` to `stop - 1`.
@@ -161,8 +169,8 @@ class Motion:
             return self._before, -_NO_END, 0
         if interval >= self.samples:
             return self._after, self.samples, _NO_END
-        number = int(np.searchsorted(self._ends, interval, side="right"))
-        found, end = self._segments[number], int(self._ends[number])
+        number = bisect_right(self._ends, interval)
+        found, end = self._segments[number], self._ends[number]
         return found, end - found.intervals, end
 
 

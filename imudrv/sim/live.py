@@ -23,6 +23,7 @@ from imudrv.sim.capture import WireChunk, wire
 from imudrv.sim.links import open_line
 from imudrv.sim.links.base import LineOptions
 from imudrv.sim.scenario import Scenario, samples
+from imudrv.sim.unit import More
 from imudrv.units import NS
 from imudrv.wire.layout import Layout
 
@@ -60,10 +61,12 @@ class PacedPlayback:
         Scenario to simulate.
     layout : Layout
         Layout of the profile.
+    more : callable, optional
+        See `imudrv.sim.unit.simulate`.
     """
 
-    def __init__(self, scenario: Scenario, layout: Layout) -> None:
-        self._chunks = _ahead(wire(scenario, layout, AHEAD))
+    def __init__(self, scenario: Scenario, layout: Layout, more: More | None = None) -> None:
+        self._chunks = _ahead(wire(scenario, layout, AHEAD, more))
         self._chunk: WireChunk | None = None
         self._row = 0
         self._current()
@@ -190,6 +193,7 @@ def play(
     say: Callable[[str], None],
     link: str | None = None,
     stop: threading.Event | None = None,
+    more: More | None = None,
 ) -> Played:
     """Play a scenario as hardware in the loop, to its end or until `stop` is set.
 
@@ -213,6 +217,8 @@ def play(
         Stable name for a pty: a symbolic link, renewed after an unplug.
     stop : Event, optional
         Ends the run when set; in the main thread Ctrl-C and SIGTERM set it too.
+    more : callable, optional
+        Next motion after those of the scenario, see `imudrv.sim.unit.simulate`; it is used two seconds later.
 
     Returns
     -------
@@ -229,7 +235,7 @@ def play(
     latest_ns = last_ns = 0
     with (
         _signals_set(stop),
-        closing(PacedPlayback(scenario, layout)) as unit,
+        closing(PacedPlayback(scenario, layout, more)) as unit,
         # the first samples are simulated before the line is announced
         closing(open_line(target, profile, options, link)) as line,
     ):

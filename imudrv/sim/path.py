@@ -7,17 +7,18 @@ sinusoids, faded in and out by the same quintic.
 **Integrals** are Gauss-Legendre over panels of at most 1 ms, of the order that the highest frequency needs.
 """
 
-from math import ceil, cos, exp, floor, lgamma, log, pi, radians, sin
+from math import ceil, cos, exp, floor, hypot, lgamma, log, pi, radians, sin
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from imudrv.arrays import Array
 from imudrv.kernels import kernel
 from imudrv.nav.attitude import rotation
-from imudrv.sim.scenario import OneMotion, Rest, Rock, Rotate, Start, Vibrate, intervals
-from imudrv.units import DEG, MM, STANDARD_GRAVITY
+from imudrv.sim.scenario import Carry, OneMotion, Rest, Rock, Rotate, Side, Start, Vibrate, intervals
+from imudrv.units import ARCSEC, DEG, MM, STANDARD_GRAVITY
 from imudrv.vectors import Vector
 
 SINUSOIDS: Final = 32
@@ -201,14 +202,14 @@ def path_segment(
 
     Parameters
     ----------
-    motion : Rest or Rotate or Rock or Vibrate
+    motion : Rest or Rotate or Carry or Rock or Vibrate
         The motion.
     C_nb : ndarray, shape (3, 3)
         Attitude at its start.
     quadrature : Quadrature
         How to place the nodes.
     rng : Generator
-        Draws frequencies and phases of random motion.
+        Draws frequencies and phases of random motion, and the errors of a hand.
 
     Returns
     -------
@@ -217,8 +218,10 @@ def path_segment(
     at_rest = still(intervals(motion.duration_s, quadrature.interval_s), C_nb, quadrature)
     if isinstance(motion, Rotate):
         return _rotating(motion, at_rest, quadrature)
+    if isinstance(motion, Carry):
+        return _carried(motion, at_rest, quadrature, rng)
     if isinstance(motion, Rest):
-        return at_rest
+        return _sinking(motion, at_rest, quadrature) if any(motion.sinks_arcsec) else at_rest
     shaken = _shaken(motion, at_rest, quadrature, rng)
     if isinstance(motion, Rock) and motion.rate_peak_deg_per_s is not None:
         return _bounded(shaken, motion.rate_peak_deg_per_s * DEG, quadrature.interval_s)
@@ -246,6 +249,66 @@ def _rotating(motion: Rotate, at_rest: PathSegment, quadrature: Quadrature) -> P
         return _wobbling(motion, axis_b, at_rest._replace(angle_rad=angle), quadrature, bandwidth_hz)
     return at_rest._replace(
         axes_b=np.array([axis_b, axis_b, axis_b]), angle_rad=angle, nodes=quadrature.nodes(bandwidth_hz)
+    )
+
+
+def _sinking(motion: Rest, at_rest: PathSegment, quadrature: Quadrature) -> PathSegment:
+    """Turn the plate about a horizontal axis while the body rests on it."""
+    east, north = (arcsec * ARCSEC for arcsec in motion.sinks_arcsec)
+    turn = Rotate(
+        angle_deg=hypot(east, north) / DEG,
+        duration_s=motion.duration_s,
+        axis_n=(-north / ARCSEC, east / ARCSEC, 0.0),
+    )
+    return _rotating(turn, at_rest, quadrature)
+
+
+def _carried(
+    motion: Carry, at_rest: PathSegment, quadrature: Quadrature, rng: np.random.Generator
+) -> PathSegment:
+    """Turn the body into the pose, as well as a hand can, and lift it meanwhile."""
+    lean, heading = 1e-3 * motion.lean_mrad, radians(motion.heading_deg)
+    error = rng.normal(0.0, [lean, lean, heading])
+    target = _small_rotation(error) @ _pose(motion.up, motion.east)
+    turn = Rotation.from_matrix(target @ at_rest.C_nb.T).as_rotvec()
+    angle = float(np.linalg.norm(turn))
+    x, y, z = (turn / angle).tolist() if angle > 0.0 else (0.0, 0.0, 1.0)
+    rotate = Rotate(
+        angle_deg=angle / DEG,
+        duration_s=motion.duration_s,
+        axis_n=(x, y, z),
+        wobble_deg=motion.wobble_deg,
+        wobble_hz=motion.wobble_hz,
+    )
+    return _lifted(_rotating(rotate, at_rest, quadrature), motion.lift_mm * MM, quadrature)
+
+
+def _pose(up: Side, east: Side) -> Array:
+    """Return the attitude `C_nb` of a pose."""
+    z, x = (np.eye(3)["XYZ".index(side[1])] * (-1.0 if side[0] == "-" else 1.0) for side in (up, east))
+    return np.stack([x, np.cross(z, x), z])
+
+
+def _small_rotation(vector: Array) -> Array:
+    return np.asarray(Rotation.from_rotvec(vector).as_matrix(), np.float64)
+
+
+def _lifted(segment: PathSegment, height_m: float, quadrature: Quadrature) -> PathSegment:
+    """Add a lift to a motion: a sinusoid of frequency 0, faded in and out."""
+    nodes, up = segment.nodes, np.zeros((6, 1))
+    up[5] = height_m
+    return segment._replace(
+        ramp=max(1, segment.intervals // 4),
+        rate=np.append(segment.rate, 0.0),
+        cycles=np.concatenate([segment.cycles, split_cycles([0.0], quadrature.interval_s)]),
+        cosine=np.concatenate([segment.cosine, up], axis=1),
+        sine=np.concatenate([segment.sine, np.zeros((6, 1))], axis=1),
+        offset_cosine=np.concatenate(
+            [segment.offset_cosine.reshape(-1, nodes.offset_s.size), np.ones((1, nodes.offset_s.size))]
+        ),
+        offset_sine=np.concatenate(
+            [segment.offset_sine.reshape(-1, nodes.offset_s.size), np.zeros((1, nodes.offset_s.size))]
+        ),
     )
 
 

@@ -55,9 +55,10 @@ class Start(Model):
 
 
 class Rest(Model):
-    """Body at rest."""
+    """Body at rest, on a plate that meanwhile sinks by `sinks_arcsec` to the east and to the north."""
 
     duration_s: Duration
+    sinks_arcsec: tuple[Change, Change] = (0.0, 0.0)
 
 
 class Rotate(Model):
@@ -83,6 +84,34 @@ class Rotate(Model):
             raise ValueError(
                 f"axis_n: expected a direction, with a component of at least 0.001, got {self.axis_n}"
             )
+        return self
+
+
+Side: TypeAlias = Literal["+X", "-X", "+Y", "-Y", "+Z", "-Z"]
+"""A body axis with its sign."""
+
+
+class Carry(Model):
+    """Body carried by hand into another pose, by the shortest turn, from rest to rest.
+
+    `up` and `east`: body axes that point up and east then, but for an error of the hand: `lean_mrad` about
+    each horizontal axis and `heading_deg` about the vertical, 1 sigma. The pivot is lifted by `lift_mm` in
+    the first quarter and set down in the last; meanwhile the body wobbles as in `rotate`.
+    """
+
+    up: Side
+    east: Side
+    duration_s: Annotated[float, Key(ge=0.5, le=300)] = 5.0
+    lift_mm: Annotated[float, Key(ge=0, le=2000)] = 120.0
+    wobble_deg: Annotated[float, Key(ge=0, le=20)] = 1.5
+    wobble_hz: Annotated[float, Key(gt=0, le=20)] = 1.3
+    lean_mrad: Annotated[float, Key(ge=0, le=100)] = 4.0
+    heading_deg: Annotated[float, Key(ge=0, le=30)] = 3.0
+
+    @model_validator(mode="after")
+    def _two_axes(self) -> Self:
+        if self.up[1] == self.east[1]:
+            raise ValueError(f"expected two different axes up and east, got {self.up} and {self.east}")
         return self
 
 
@@ -144,7 +173,7 @@ class Vibrate(_Random):
     rate_rms_deg_per_s: tuple[Rate, Rate, Rate] = (0.0, 0.0, 0.0)
 
 
-OneMotion: TypeAlias = Rest | Rotate | Rock | Vibrate
+OneMotion: TypeAlias = Rest | Rotate | Carry | Rock | Vibrate
 
 
 class Segment(Model):
@@ -152,6 +181,7 @@ class Segment(Model):
 
     rest: Rest | None = None
     rotate: Rotate | None = None
+    carry: Carry | None = None
     turns: Turns | None = None
     rock: Rock | None = None
     vibrate: Vibrate | None = None
@@ -169,7 +199,10 @@ class Segment(Model):
         """The motion of the one key; several for many turns."""
         if self.turns is not None:
             return self.turns.motions
-        motions: tuple[OneMotion | None, ...] = self.rest, self.rotate, self.rock, self.vibrate
+        motions: tuple[OneMotion | None, ...] = (
+            *(self.rest, self.rotate, self.carry),
+            *(self.rock, self.vibrate),
+        )
         return tuple(motion for motion in motions if motion is not None)
 
 
@@ -201,6 +234,14 @@ class BiasStep(Model):
     at_s: Time
     gyro_deg_per_h: tuple[Change, Change, Change] = (0.0, 0.0, 0.0)
     accelerometer_ug: tuple[Change, Change, Change] = (0.0, 0.0, 0.0)
+
+
+class BiasWander(Model):
+    """Wander of the biases: Gauss-Markov processes of a time constant, 1 sigma of each axis."""
+
+    time_constant_s: Annotated[float, Key(ge=1, le=1_000_000)] = 700.0
+    gyro_deg_per_h: Amount = 0.0
+    accelerometer_ug: Amount = 0.0
 
 
 class Noise(Model):
@@ -255,7 +296,7 @@ class Unit(Model):
     calibration is that of a unit whose lever arms are still to be found. Residuals make the unit differ from
     its calibration; `seed` draws them, by default that of the scenario: scenarios with the same `seed` here
     and different ones there are of one unit. The sample interval of the accelerometers ends
-    `accelerometer_skew_s` later than that of the gyros.
+    `accelerometer_skew_s` later than that of the gyros, beside the skew in the calibration.
     """
 
     calibration_file: Annotated[str, Key(min_length=1, max_length=4096)] | None = None
@@ -264,6 +305,7 @@ class Unit(Model):
     seed: Annotated[int, Key(ge=0, lt=2**63)] | None = None
     residuals: Residuals = Residuals()
     bias_steps: Annotated[tuple[BiasStep, ...], Key(max_length=1000)] = ()
+    bias_wander: BiasWander | None = None
     noise: Noise = Noise()
     dither: Dither | None = None
     accelerometer_skew_s: Annotated[float, Key(ge=-0.01, le=0.01)] = 0.0

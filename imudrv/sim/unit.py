@@ -4,7 +4,10 @@ The true unit is a calibration, with the conventions of the file inverted, that 
 from the one that will compensate it:
 
     gyro axes            N_g = C_bg^-1 (dtheta_b + b_g tau) / k_g
-    accelerometer i      N_i = K_i (integral of f_i + b_i tau)
+    accelerometer i      N_i = K_i (e_i + b_i tau)
+
+where `e_i - q_i e_i^2 / tau - asymmetry_i |e_i| / 2` is the integral of f_i, over an interval that ends later
+by the skew,
 
 with `k_g`, `K`, `b_g`, `b` each at the temperature of the sample: the scale in the file times
 `1 + ppm_per_k (T - T_reference)`, the bias plus `bias_per_k (T - T_reference)`. `N` are pulses, or rad and
@@ -13,10 +16,10 @@ carried into the next sample. The encoder makes counts of rates and of floating-
 Bias steps change `b_g` and `b` during the run.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from math import exp, pi, sin
-from typing import Final, NamedTuple
+from math import exp, pi, sin, sqrt
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -31,9 +34,18 @@ from imudrv.nav.earth import earth_rate_n
 from imudrv.records import Records
 from imudrv.sim.integrate import Body, Dithering, Integrals, Motion, Shaking
 from imudrv.sim.path import cycles_at, split_cycles
-from imudrv.sim.scenario import BiasStep, Dither, Faults, Motor, Residuals, Saturation, Scenario, nominal
+from imudrv.sim.scenario import (
+    Dither,
+    Faults,
+    Motor,
+    OneMotion,
+    Residuals,
+    Saturation,
+    Scenario,
+    nominal,
+)
 from imudrv.units import ARCSEC, DEG_PER_H, DEG_PER_SQRT_H, MM, NS, PPM, STANDARD_GRAVITY, UG, URAD
-from imudrv.vectors import Vector, add, dot, row
+from imudrv.vectors import Vector, dot, row
 from imudrv.wire.layout import Layout, SequenceKind, Values
 
 PER_SQRT_H: Final = 1.0 / 60.0
@@ -53,6 +65,10 @@ TRUTH: Final = np.dtype(
 """Truth of one sample interval."""
 
 
+More: TypeAlias = Callable[[], OneMotion]
+"""Source of the next motion of a unit that is moved while it is simulated."""
+
+
 @dataclass(frozen=True)
 class Chunk:
     """Consecutive samples.
@@ -67,6 +83,10 @@ class Chunk:
 
     pulses: Records
     truth: Records
+
+
+_WANDER_STEP: Final = 0.05
+"""Interval of the steps of a bias wander, in time constants."""
 
 
 class _Counts(NamedTuple):
@@ -93,10 +113,12 @@ class _Electronics(NamedTuple):
     accelerometer_bias: Array
     accelerometer_bias_per_k: Array
     accelerometer_scale_per_k: Array
+    quadratic: Array  # s^2/m
+    half_asymmetry: Array
     accelerometer_noise: float  # m/s
     counts: _Counts
     step_at_s: Array  # (m,), when biases change
-    steps: Array  # (m, 6), of gyros, rad/s, and accelerometers, m/s^2
+    steps: Array  # (m + 1, 6), sums of the changes before, of gyros, rad/s, and accelerometers, m/s^2
     reference_degc: float
     start_degc: float
     slope_k_per_s: float
@@ -145,7 +167,9 @@ def draw_true_unit(scenario: Scenario, layout: Layout) -> Coefficients:
     )
 
 
-def simulate(scenario: Scenario, layout: Layout, chunk: int = 65_536) -> Iterator[Chunk]:
+def simulate(
+    scenario: Scenario, layout: Layout, chunk: int = 65_536, more: More | None = None
+) -> Iterator[Chunk]:
     """Simulate a scenario.
 
     Parameters
@@ -157,6 +181,8 @@ def simulate(scenario: Scenario, layout: Layout, chunk: int = 65_536) -> Iterato
         Layout of the profile; durations of the motion are rounded to whole sample intervals.
     chunk : int
         Number of samples at a time; any value gives the same bits.
+    more : callable, optional
+        Called for the next motion when those before are used up; there is no end then.
 
     Yields
     ------
@@ -179,14 +205,20 @@ def simulate(scenario: Scenario, layout: Layout, chunk: int = 65_536) -> Iterato
     truth = draw_true_unit(scenario, layout)
     rng = _generator(scenario.seed, 3)
     # With a skew, an accelerometer sample is the late part of one interval and the early part of a later one.
-    skew, split_ns = divmod(round(scenario.unit.accelerometer_skew_s / NS), interval)
+    skew, split_ns = divmod(round((truth.skew_s + scenario.unit.accelerometer_skew_s) / NS), interval)
     motion = Motion(scenario, _body(scenario, truth, interval_s), split_ns * NS)
     electronics = _electronics(scenario, truth, layout)
     start = scenario.start.counter if layout.sequence.kind is SequenceKind.COUNTER else 0
     carry = np.zeros(6)
-    for first in range(0, motion.samples, chunk):
+    first, n = 0, 0
+    begin = min(0, skew)
+    while True:
+        first += n
+        while more is not None and motion.samples <= first + chunk + max(0, skew + 1):
+            motion.append(more())
         n = min(chunk, motion.samples - first)
-        begin = min(0, skew)
+        if n <= 0:
+            return
         around = motion.integrals(first + begin, first + n + max(0, skew + 1))
         own = Integrals(*(a[-begin : n - begin] for a in around))
         later = skew - begin
@@ -350,7 +382,7 @@ def _electronics(scenario: Scenario, truth: Coefficients, layout: Layout) -> _El
     settles = temperature.settles_at_degc
     G = _inverse(truth.C_bg)
     terms = truth.temperature or TemperatureTerms(0.0, 0.0, 0.0)
-    step_at_s, steps = _bias_steps(unit.bias_steps)
+    step_at_s, steps = _bias_changes(scenario)
     return _Electronics(
         interval_s=interval_s,
         G=G,
@@ -364,6 +396,8 @@ def _electronics(scenario: Scenario, truth: Coefficients, layout: Layout) -> _El
         accelerometer_bias=truth.accelerometer_bias,
         accelerometer_bias_per_k=terms.accelerometer_bias,
         accelerometer_scale_per_k=terms.accelerometer_scale,
+        quadratic=truth.quadratic,
+        half_asymmetry=0.5 * truth.asymmetry,
         accelerometer_noise=unit.noise.vrw_m_s_per_sqrt_h * PER_SQRT_H * interval_s**0.5,
         counts=_counts(layout, unit.saturation),
         step_at_s=step_at_s,
@@ -376,13 +410,36 @@ def _electronics(scenario: Scenario, truth: Coefficients, layout: Layout) -> _El
     )
 
 
-def _bias_steps(steps: tuple[BiasStep, ...]) -> tuple[Array, Array]:
+def _bias_changes(scenario: Scenario) -> tuple[Array, Array]:
+    """Return the times of the bias steps and of the wander, in order, and the sums before each of them."""
+    steps = scenario.unit.bias_steps
     at_s, changes = np.zeros(len(steps)), np.zeros((len(steps), 6))
     for k, step in enumerate(steps):
         at_s[k] = step.at_s
         changes[k, :3] = np.array(step.gyro_deg_per_h) * DEG_PER_H
         changes[k, 3:] = np.array(step.accelerometer_ug) * UG
-    return at_s, changes
+    wanders_at_s, wanders = _wander(scenario)
+    at_s, changes = np.append(at_s, wanders_at_s), np.concatenate([changes, wanders])
+    order = np.argsort(at_s, kind="stable")
+    sums = np.concatenate([np.zeros((1, 6)), np.cumsum(changes[order], axis=0)])
+    return at_s[order], sums
+
+
+def _wander(scenario: Scenario) -> tuple[Array, Array]:
+    """Return times and sizes of the steps of Gauss-Markov processes."""
+    wander = scenario.unit.bias_wander
+    if wander is None:
+        return np.zeros(0), np.zeros((0, 6))
+    interval_s = _WANDER_STEP * wander.time_constant_s
+    duration_s = sum(motion.duration_s for motion in scenario.motions)
+    normal = _generator(scenario.seed, 8).standard_normal((1 + int(duration_s / interval_s), 6))
+    left = exp(-_WANDER_STEP)
+    values = np.empty_like(normal)
+    values[0] = normal[0]
+    for k in range(1, len(normal)):
+        values[k] = left * values[k - 1] + sqrt(1.0 - left**2) * normal[k]
+    values *= np.repeat([wander.gyro_deg_per_h * DEG_PER_H, wander.accelerometer_ug * UG], 3)
+    return interval_s * np.arange(len(values), dtype=np.float64), np.diff(values, axis=0, prepend=0.0)
 
 
 def _truth(pulses: Records, own: Integrals) -> Records:
@@ -432,7 +489,7 @@ def _count(
             bias = (
                 unit.accelerometer_bias[m] + warmer * unit.accelerometer_bias_per_k[m] + accelerometer_step[m]
             )
-            speed = velocity[i, m] + tau * bias + unit.accelerometer_noise * noise[i, 3 + m]
+            speed = _input(unit, m, velocity[i, m]) + tau * bias + unit.accelerometer_noise * noise[i, 3 + m]
             scale = unit.accelerometer_scale[m] * (1.0 + warmer * unit.accelerometer_scale_per_k[m])
             increments[i, 3 + m], is_over = _sent(speed * scale, unit.counts, carry, 3 + m)
             overflow[i] |= is_over
@@ -440,15 +497,20 @@ def _count(
 
 
 @kernel
+def _input(unit: _Electronics, axis: int, velocity: float) -> float:
+    """Return what an accelerometer that is not linear makes of a velocity: two steps of a fixed point."""
+    speed = velocity
+    for _ in range(2):  # to 1e-6 of the term, itself below 1e-3
+        curve = unit.quadratic[axis] * speed * speed / unit.interval_s
+        speed = velocity + curve + unit.half_asymmetry[axis] * abs(speed)
+    return speed
+
+
+@kernel
 def _bias_change(unit: _Electronics, t: float) -> tuple[Vector, Vector]:
-    """Return the sum of the bias steps before the end of a sample, of gyros and accelerometers."""
-    gyro, accelerometer = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    for k in range(unit.step_at_s.size):
-        if t > unit.step_at_s[k]:
-            step = unit.steps[k]
-            gyro = add(gyro, (step[0], step[1], step[2]))
-            accelerometer = add(accelerometer, (step[3], step[4], step[5]))
-    return gyro, accelerometer
+    """Return the sum of the bias changes before the end of a sample, of gyros and accelerometers."""
+    total = unit.steps[np.searchsorted(unit.step_at_s, t)]
+    return (total[0], total[1], total[2]), (total[3], total[4], total[5])
 
 
 @kernel

@@ -3,6 +3,7 @@
 base      interface of a sink           backlog   queue of datagrams for one consumer
 network   UDP, TCP                      serial    serial line
 can       CAN bus                       file      growing file
+zenoh     Zenoh
 recorder  MCAP recording                history   the latest reads, in memory
 """
 
@@ -10,7 +11,7 @@ from imudrv.errors import InputError
 from imudrv.sinks.base import Sink
 from imudrv.wire.layout import Layout
 
-SCHEMES = ("udp", "tcp", "serial", "can", "file")
+SCHEMES = ("udp", "tcp", "serial", "can", "zenoh", "file")
 
 
 def open_sink(url: str, layout: Layout) -> Sink:
@@ -20,7 +21,7 @@ def open_sink(url: str, layout: Layout) -> Sink:
     ----------
     url : str
         ``udp://HOST:PORT``, ``tcp://HOST:PORT``, ``serial://PATH?baudrate=...``,
-        ``can://INTERFACE/CHANNEL?profile=...`` or ``file:NAME.i50n``.
+        ``can://INTERFACE/CHANNEL?profile=...``, ``zenoh://imu50/BENCH/UNIT`` or ``file:NAME.i50n``.
     layout : Layout
         Layout of the unit.
 
@@ -52,6 +53,10 @@ def open_sink(url: str, layout: Layout) -> Sink:
         from imudrv.sinks.can import CanSink
 
         return CanSink(url, layout)
+    if scheme == "zenoh":
+        from imudrv.sinks.zenoh import ZenohSink
+
+        return ZenohSink(url)
     if scheme == "file":
         from imudrv.sinks.file import FileSink
 

@@ -5,7 +5,6 @@ chunked nor compressed, as a chunk would delay data; `imudrv.recording.pack.pack
 """
 
 import json
-import struct
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -16,14 +15,14 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Final, Generic, TypeVar
 
-from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Metadata, Schema
 from mcap.well_known import MessageEncoding, SchemaEncoding
-from mcap.writer import Writer
 
 from imudrv.files.spool import AppendThread, Piece
 from imudrv.hostclock import now_ns
 from imudrv.recording import format
 from imudrv.recording.format import pack_messages
+from imudrv.recording.writer import McapWriter
 from imudrv.records import Arrival, Source, Timebase
 from imudrv.sinks.base import Batch, SinkState
 from imudrv.sinks.history import Moment
@@ -37,11 +36,6 @@ _PIECE: Final = 256
 """Most reads, and batches, written at a time."""
 _PIECE_BYTES: Final = 1 << 20
 """About as many bytes at a time, so that no message is larger than readers take (4 MiB)."""
-
-# A message; packing takes 0.2 us here and 4 us in the library, during which the loop cannot run. So the
-# summary of the library has no statistics of messages.
-_MESSAGE: Final = struct.Struct("<BQHIQQ")
-_BODY: Final = _MESSAGE.size - 9
 
 T = TypeVar("T")
 
@@ -97,10 +91,9 @@ class Recorder:
         self._calibrations: deque[tuple[int, bytes]] = deque(maxlen=10)
         self._put = 0
         self._reported = 0
-        self._sequences = [0] * 6
         self._timebase = Timebase()  # of the read written last
         self._staging = _Staging()
-        self._writer = Writer(self._staging, use_chunking=False, use_statistics=False)
+        self._writer = McapWriter(self._staging)
         self._begin(profile, calibration, source, port, unit)
         self._spool = AppendThread(path, self._staging.take(), self._next_piece, self._last_piece, sync_s)
 
@@ -193,6 +186,11 @@ class Recorder:
         queued = self._put - self._spool.sent - dropped
         return SinkState(str(self._path), words, not trouble, self._spool.sent, dropped, queued)
 
+    @property
+    def finished(self) -> Path | None:
+        """The file, once it is closed with its end; None if not, or if its name does not lead to it."""
+        return self._path if self._spool.is_finished and not self.displaced else None
+
     def close(self) -> None:
         """Write what waits and the end of the file, for some seconds at the most, and let go."""
         self.poll()
@@ -200,18 +198,18 @@ class Recorder:
 
     def _begin(self, profile: bytes, calibration: bytes | None, source: Source, port: str, unit: str) -> None:
         """Write the start of the file: channels, origin, profile, calibration."""
-        writer, t_ns = self._writer, now_ns()
-        writer.start(library=f"imu50 {version('imu50')}")
-        status = writer.register_schema("imu50.Status", SchemaEncoding.JSONSchema, _STATUS_SCHEMA)
-        event = writer.register_schema("imu50.Event", SchemaEncoding.JSONSchema, _EVENT_SCHEMA)
-        clock = writer.register_schema("imu50.Timebase", SchemaEncoding.JSONSchema, _TIMEBASE_SCHEMA)
-        wire = format.CAN_MESSAGES if self._can else format.BYTES
-        # the library numbers channels in this order: _WIRE, _INCREMENTS, _STATUS, _EVENTS, _CLOCK
-        writer.register_channel(format.WIRE, wire, 0)
-        writer.register_channel(format.INCREMENTS, format.DATAGRAMS, 0)
-        writer.register_channel(format.STATUS, MessageEncoding.JSON, status)
-        writer.register_channel(format.EVENTS, MessageEncoding.JSON, event)
-        writer.register_channel(format.CLOCK, MessageEncoding.JSON, clock)
+        writer = self._writer
+        encodings = {
+            _WIRE: format.CAN_MESSAGES if self._can else format.BYTES,
+            _INCREMENTS: format.DATAGRAMS,
+        }
+        for number, (topic, name, schema) in _CHANNELS.items():
+            encoding = SchemaEncoding.JSONSchema if schema else ""
+            writer.define(Schema(id=number, name=name, encoding=encoding, data=schema))
+            encoding = encodings.get(number, MessageEncoding.JSON)
+            writer.define(
+                Channel(id=number, topic=topic, message_encoding=encoding, metadata={}, schema_id=number)
+            )
         origin = {
             "version": version("imu50"),
             "unit": unit,
@@ -219,13 +217,16 @@ class Recorder:
             "source": source.name.lower(),
             "calibration_sha256": sha256(calibration).hexdigest() if calibration is not None else "",
         }
-        writer.add_metadata(format.ORIGIN, origin)
+        writer.add_metadata(Metadata(format.ORIGIN, origin))
+        t_ns = now_ns()
         self._attach(t_ns, format.PROFILE, profile)
         if calibration is not None:
             self._attach(t_ns, format.CALIBRATION, calibration)
 
     def _attach(self, t_ns: int, name: str, data: bytes) -> None:
-        self._writer.add_attachment(t_ns, t_ns, name, "application/yaml", data)
+        self._writer.attach(
+            Attachment(create_time=t_ns, log_time=t_ns, name=name, media_type="application/yaml", data=data)
+        )
 
     def _next_piece(self) -> Piece:
         with suppress(IndexError):
@@ -238,28 +239,22 @@ class Recorder:
         for arrival, piece in zip(arrivals, pieces, strict=True):
             if arrival.timebase != self._timebase:
                 self._timebase = arrival.timebase
-                self._message(_CLOCK, arrival.t_ns, json.dumps(self._timebase._asdict()).encode())
-            self._message(_WIRE, arrival.t_ns, piece)  # type: ignore[arg-type]
+                self._writer.message(_CLOCK, arrival.t_ns, json.dumps(self._timebase._asdict()).encode())
+            self._writer.message(_WIRE, arrival.t_ns, piece)  # type: ignore[arg-type]
         batches = self._datagrams.take(_PIECE)
         datagrams = b"".join(batches)
         if datagrams:
-            self._message(_INCREMENTS, now_ns(), datagrams)
+            self._writer.message(_INCREMENTS, now_ns(), datagrams)
         with suppress(IndexError):
             while True:
                 t_ns, channel, document = self._notes.popleft()
-                self._message(channel, t_ns, json.dumps(document(), default=str).encode())
+                self._writer.message(channel, t_ns, json.dumps(document(), default=str).encode())
         more = self._wire.left or self._datagrams.left
         return Piece(self._staging.take(), len(datagrams) // SIZE, more)
 
     def _last_piece(self) -> bytes:
-        self._writer.finish()  # type: ignore[no-untyped-call]
+        self._writer.finish()
         return self._staging.take()
-
-    def _message(self, channel: int, t_ns: int, data: bytes) -> None:
-        sequence = self._sequences[channel]
-        self._sequences[channel] = (sequence + 1) & 0xFFFFFFFF
-        head = _MESSAGE.pack(Opcode.MESSAGE, _BODY + len(data), channel, sequence, t_ns, t_ns)
-        self._staging.write(head + data)
 
 
 _WIRE, _INCREMENTS, _STATUS, _EVENTS, _CLOCK = range(1, 6)
@@ -268,6 +263,14 @@ _TIMEBASE_SCHEMA: Final = json.dumps(
     {"type": "object", "properties": {name: {"type": "integer"} for name in Timebase._fields}}
 ).encode()
 _EVENT_SCHEMA: Final = json.dumps({"type": "object", "properties": {"text": {"type": "string"}}}).encode()
+_CHANNELS: Final = {
+    _WIRE: (format.WIRE, "imu50.Wire", b""),
+    _INCREMENTS: (format.INCREMENTS, "imu50.Datagrams", b""),
+    _STATUS: (format.STATUS, "imu50.Status", _STATUS_SCHEMA),
+    _EVENTS: (format.EVENTS, "imu50.Event", _EVENT_SCHEMA),
+    _CLOCK: (format.CLOCK, "imu50.Timebase", _TIMEBASE_SCHEMA),
+}
+"""Topic, name of the schema and schema of each channel; empty: only documentation describes the bytes."""
 
 
 class _Queue(Generic[T]):
@@ -304,18 +307,10 @@ class _Queue(Generic[T]):
 
 
 class _Staging(BytesIO):
-    """Buffer that the library writes to; `tell` gives positions in the file."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._base = 0
-
-    def tell(self) -> int:
-        return self._base + super().tell()
+    """Buffer between the writer and the file."""
 
     def take(self) -> bytes:
         data = self.getvalue()
-        self._base += len(data)
         self.seek(0)
         self.truncate()
         return data

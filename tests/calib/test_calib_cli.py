@@ -204,7 +204,7 @@ def test_a_chosen_channel_of_a_log_of_two_units_is_named_in_certificate_and_repo
             units += text.splitlines(keepends=True)
         (here / f"{pose}.log").write_text("".join(sorted(units, key=lambda line: line[:20])))
     logs = ["identify", "x.log", "y.log", "z.log", "--profile", "imu50-can", "--calibration", "unit.yaml"]
-    logs += ["--site", "site.yaml", "--channel", "can0", "-o", "chosen.yaml"]
+    logs += ["--site", "site.yaml", "--channel", "can0", "-o", "chosen.yaml", "-v"]
     assert main(logs) == 0
     assert "z.log, imu50-can, channel can0" in capsys.readouterr().out
     provenance = yaml.safe_load((here / "chosen.yaml").read_text())["provenance"]
@@ -215,11 +215,16 @@ def test_a_chosen_channel_of_a_log_of_two_units_is_named_in_certificate_and_repo
 def test_a_certificate_that_the_data_contradict_is_refused_but_the_report_is_there(
     here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("calib.estimation.result.CHI_SQUARE_LIMIT", 1e-3)
+    monkeypatch.setattr("calib.estimation.result.SCATTER_LIMIT", 1e-3)
     assert identify(*CAPTURES, "-o", "bad.yaml", "--json", "bad.json", "--report", "bad.html") == 2
     printed = capsys.readouterr()
-    assert re.search(r"^  bad +The velocities contradict the model", printed.out, re.MULTILINE)
-    assert "no certificate: the velocities contradict the model: expected chi-square" in printed.err
+    assert re.search(
+        r"^  bad +The velocities within the rests contradict the noise", printed.out, re.MULTILINE
+    )
+    assert (
+        "no certificate: the velocities within the rests contradict the noise of the alignments"
+        in printed.err
+    )
     assert not (here / "bad.yaml").exists()
     assert (here / "bad.json").exists()
     assert (here / "bad.html").exists()
@@ -291,7 +296,7 @@ def test_a_certificate_names_the_file_that_its_arms_are_from(
 
 def test_the_plain_method_and_a_gauge_by_name(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert identify(*CAPTURES, "-o", "plain.yaml", "--method", "plain", "--gauge", "y") == 0
-    assert "no residuals to test the model" in " ".join(capsys.readouterr().out.split())
+    assert "Arms determined, not checked: no redundant rotation" in " ".join(capsys.readouterr().out.split())
     new = yaml.safe_load((here / "plain.yaml").read_text())
     assert new["size_effect"]["gauge"] == "y"
     assert new["size_effect"]["r_mm"]["y"] == [0.0, 0.0, 0.0]
@@ -313,7 +318,7 @@ def test_the_plain_method_and_a_gauge_by_name(here: Path, capsys: pytest.Capture
             "method plain: expected pivot free, six components",
         ),
         (["z.raw", "x.raw", "z.raw"], "expected another capture, got that of z.raw once more"),
-        (["z.raw"], "add rotations with another axis up"),
+        (["z.raw"], "Z up alone is not enough: add captures with X up and Y up"),
         (["short.raw"], "turned 150.0 deg, want 180 +- 5"),
         (["z.raw", "short.raw"], "turned 150.0 deg, want 180 +- 5"),
         (["still.raw"], "at rest, no motion at all"),

@@ -18,9 +18,16 @@ from calib.certificate import (
     write,
 )
 from calib.detection.acceptance import RotationLimits
-from calib.detection.noise import Noise
-from calib.estimation.result import CENTROID_BASIS, LeverArmEstimate, ParameterEstimate, RunResult, TurnResult
-from calib.estimation.runs import Priors
+from calib.estimation.noise import SensorNoise
+from calib.estimation.priors import Priors
+from calib.estimation.result import (
+    CENTROID_BASIS,
+    ChiSquare,
+    LeverArmEstimate,
+    ParameterEstimate,
+    RunResult,
+    TurnResult,
+)
 from calib.identification import IdentificationResult, PriorCalibration
 from calib.lever_arms.gauge import convert
 from calib.result_file import result_document, write_json
@@ -40,6 +47,8 @@ def identification(**changes: object) -> IdentificationResult:
         label="z",
         turns=(TurnResult("z", True, np.array([0.2, -0.1, 0.0]), np.zeros((3, 9)), np.zeros(3)),),
         H_rest=1e-4,
+        rate_filter="dither",
+        lines=(),
         t_s=np.arange(4.0),
         v_n=np.full((4, 2), 1e-3),
         fitted_n=np.full((4, 2), 0.5e-3),
@@ -53,9 +62,10 @@ def identification(**changes: object) -> IdentificationResult:
         direction_sigma=np.array([1e-5, 1.1e-5, 1.2e-5, 1.8e-5, 1.9e-5, 2e-5, 1.0, 1.0, 1.0]),
         singular_values=np.array([8.0, 8.0, 8.0, 4.7, 4.7, 4.7, 0.0, 0.0, 0.0]),
         reason="rank 6",
-        chi_square=90.0,
-        degrees_of_freedom=100,
-        noise=Noise(1e-6, 1e-5, 1e-6, 1e-6),
+        scatter=ChiSquare(90.0, 100, 200),
+        redundancy=ChiSquare(5.0, 6),
+        dither_error=0.01,
+        noise=SensorNoise(1e-6, 1e-5, 200),
         parameters=(ParameterEstimate("accelerometer_bias_x", 1e-4, 2e-4, 5e-4),),
         correlation=np.full((9, 1), 0.1),
         leave_one_out=(),
@@ -111,7 +121,8 @@ def test_the_certificate_keeps_the_static_calibration_and_has_the_provenance_of_
     assert isinstance(how, dict)
     assert how["calibration"] == {"name": "unit.yaml", "sha256": "ab" * 32}
     assert how["rank"] == 6
-    assert how["chi_square"] == 90.0
+    assert how["scatter"]["chi_square"] == 90.0
+    assert how["redundancy"]["degrees_of_freedom"] == 6
     assert how["site"] == {"latitude_deg": 28.2, "longitude_deg": 113.0, "height_m": 60.0}
     assert how["differences_mm"] == {
         "x_minus_y": pytest.approx([46.25, -40.25, -2.0]),
@@ -120,23 +131,30 @@ def test_the_certificate_keeps_the_static_calibration_and_has_the_provenance_of_
     assert how["residual_scatter_mm_s"] == {"z": 0.0}  # a constant offset is none
 
 
-def test_nothing_is_certified_that_the_data_contradict() -> None:
-    found = identification(chi_square=250.0)
-    with pytest.raises(InputError, match=r"no certificate: .*expected chi-square of about 100, got 250"):
-        certificate(found, found.arms)
-
-
-def test_nothing_is_certified_on_increments_that_carry_dither() -> None:
-    found = identification()
-    shaken = replace(found.result.runs[0], H_rest=0.07)  # three arcsec of dither do this in ten seconds
-    found = replace(found, result=replace(found.result, runs=(shaken,)))
-    with pytest.raises(InputError, match=r"no certificate: the gyro increments carry dither.*0\.07 \(z\)"):
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"scatter": ChiSquare(250.0, 100, 200)}, r"expected chi-square of about 100, got 250"),
+        ({"redundancy": ChiSquare(60.0, 6)}, r"the turns contradict each other: .*of about 6, got 60\.0"),
+        (
+            {"dither_error": 8.0},
+            r"the gyro increments carry dither.*0\.0001 m/s per m .*\(z\).*costs 8 sigma",
+        ),
+    ],
+)
+def test_nothing_is_certified_that_the_data_contradict(changes: dict[str, object], message: str) -> None:
+    found = identification(**changes)
+    with pytest.raises(InputError, match=f"no certificate: .*{message}"):
         certificate(found, found.arms)
 
 
 def test_as_many_equations_as_unknowns_contradict_nothing() -> None:
     found = identification(
-        chi_square=0.0, degrees_of_freedom=0, method="plain", parameters=(), correlation=np.zeros((9, 0))
+        scatter=None,
+        redundancy=ChiSquare(0.0, 0),
+        method="plain",
+        parameters=(),
+        correlation=np.zeros((9, 0)),
     )
     assert certificate(found, found.arms).size_effect is not None
 

@@ -3,14 +3,17 @@
 import re
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
+from datetime import UTC, datetime
 from io import StringIO
 from pathlib import Path
 from threading import Thread
 from time import sleep
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from rich.console import Console
 
 from calib.bench import completion
@@ -32,7 +35,7 @@ from calib.bench.screen import OperatorScreen, plain
 from calib.bench.session import Session
 from calib.bench.technician import BENCH, Mistake, technician_scenario
 from calib.bench.verify import verify
-from calib.messages import english
+from calib.messages import Message, english
 from calib.procedure.events import Accepted, Entered, Phase, Rejected, View
 from calib.procedure.plan import steps_left
 from calib.procedure.schema import Procedure
@@ -130,7 +133,7 @@ class Shown(OperatorScreen):
         super().__init__(Console(file=self.text, width=200))
         self._typed = keys
 
-    def show(self, view: View, question: str = "") -> None:
+    def show(self, view: View, question: Message | None = None) -> None:
         super().show(view, question)
         while not self.is_idle:
             sleep(0.001)
@@ -176,6 +179,7 @@ def conducted(
     keys: Typed | None = None,
     *,
     hands_free: bool = True,
+    accepts: bool = True,
     stopped: bool = True,
     history_bytes: int = MAX_BYTES,
     dropped: range = range(0),
@@ -206,6 +210,7 @@ def conducted(
         screen,
         keys,
         hands_free=hands_free,
+        accepts=accepts,
         begin=lambda _: None,
     )
     conduct.run()
@@ -245,7 +250,7 @@ def test_a_step_is_accepted_once_its_files_are_in(session: Session, batches: lis
 
 def test_with_an_operator_nothing_continues_without_a_key(session: Session, batches: list[Batch]) -> None:
     _, text = conducted(session, list(batches), hands_free=False)
-    assert "READY: CONFIRM" in text
+    assert "PRESS ENTER" in text
     assert "align" not in text
     assert session.accepted == {}
 
@@ -254,7 +259,7 @@ def test_the_operators_key_confirms(
     session: Session, batches: list[Batch], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(controllers, "REDRAW_S", 0.0)
-    keys = Typed(lambda seen: "\n" if "CONFIRM" in seen else "")
+    keys = Typed(lambda seen: "\n" if "PRESS ENTER" in seen else "")
     conducted(session, list(batches), keys, hands_free=False)
     assert list(session.accepted) == ["z-up"]
 
@@ -263,11 +268,11 @@ def test_an_aborted_session_can_be_resumed(
     session: Session, batches: list[Batch], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(controllers, "REDRAW_S", 0.0)
-    keys = Typed(lambda seen: "q" if "align" in seen else "")
+    keys = Typed(lambda seen: "y" if "[y/n]" in seen else "q" if "align" in seen else "")
     conduct, text = conducted(session, list(batches), keys)
-    assert "q again: abort" in text
+    assert "End the session? Accepted steps are kept. [y/n]" in text
     assert conduct.error is None
-    assert conduct.outcome == ""
+    assert conduct.outcome == ()
     assert sorted(events(session)[-2:]) == ["aborted", "file"]
     assert session.next_attempt("z-up") == 2
     assert not session.is_over
@@ -324,6 +329,10 @@ def test_a_recording_begins_where_the_engine_asked_for_the_unit_to_be_placed(
     assert placed.counter - 600 < pulses["counter"][0] <= placed.counter
     assert (np.diff(pulses["counter"]) == 1).all()
     assert np.array_equal(published, pulses["counter"])
+    with recording.path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    assert summary.chunk_indexes, "it is packed before its hash enters the journal"
 
 
 @pytest.mark.parametrize("history_bytes", [1 << 20, 4 << 20])
@@ -387,14 +396,14 @@ def test_recordings_are_complete_even_if_the_worker_is_late_by_a_whole_step(
     monkeypatch.setattr(session, "append", delayed_append)
     service = Service(settings, lambda _: None, [tap], history=History())
     conduct = SessionController(
-        session, LAYOUT, service, tap, Shown(keys), keys, hands_free=True, begin=lambda _: None
+        session, LAYOUT, service, tap, Shown(keys), keys, hands_free=True, accepts=True, begin=lambda _: None
     )
     worker = Thread(target=conduct.run)
     worker.start()
     service.run()
     tap.close()
     worker.join()
-    assert "expected rotations that determine 6 directions" in str(conduct.error)
+    assert "Z up alone is not enough" in str(conduct.error)
     assert list(session.accepted) == ["z-up"]
     assert verify(session.folder).faults == ()
 
@@ -435,9 +444,9 @@ def test_a_restart_of_the_unit_between_steps_is_noted(
 def found(monkeypatch: pytest.MonkeyPatch) -> None:
     """A result without recordings."""
 
-    nothing: Any = None
+    nothing: Any = SimpleNamespace(arms=None, created=datetime(2026, 1, 1, tzinfo=UTC))
     monkeypatch.setattr(completion, "identify_session", lambda _: Result(nothing, NOMINAL))
-    monkeypatch.setattr(controllers, "summary", lambda _: "a result")
+    monkeypatch.setattr(controllers, "summarise", lambda *_: None)
 
 
 def test_a_result_that_is_rejected_changes_nothing(
@@ -446,16 +455,43 @@ def test_a_result_that_is_rejected_changes_nothing(
     before = session.plan.certificate.path.read_bytes()
     monkeypatch.setattr(controllers, "decide_alone", lambda _: False)
     conduct, _ = conducted(session, list(batches), stopped=False)
-    assert "rejected; certificate unchanged" in conduct.outcome
+    assert [line.key for line in conduct.outcome] == ["result_rejected"]
     assert session.is_over
     assert session.plan.certificate.path.read_bytes() == before
+
+
+def test_without_a_person_nothing_is_accepted(session: Session, batches: list[Batch], found: None) -> None:
+    before = session.plan.certificate.path.read_bytes()
+    conduct, text = conducted(session, list(batches), stopped=False, accepts=False)
+    assert conduct.error is None
+    assert conduct.is_undecided
+    assert "nobody was there to accept the result: resume the session at a terminal" in text
+    assert "decision" not in events(session)
+    assert session.plan.certificate.path.read_bytes() == before
+
+
+def test_the_report_is_there_and_named_once_the_result_is_accepted(
+    session: Session, batches: list[Batch], found: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(controllers, "REDRAW_S", 0.0)
+    monkeypatch.setattr(controllers, "decide_alone", lambda _: True)
+    monkeypatch.setattr(completion, "certificate_document", lambda *given: str(given[2].verified.key))
+    monkeypatch.setattr(completion, "as_html", lambda text, **_: text)
+    monkeypatch.setattr(completion, "convert", lambda *_: None)
+    keys = Typed(lambda seen: "y" if "[y/n]" in seen else "q" if "Y up" in seen else "")
+    conduct, text = conducted(session, list(batches), keys, stopped=False)
+    assert conduct.error is None
+    assert conduct.outcome == ()  # the verification was aborted
+    assert f"active certificate: {session.plan.certificate.path}" in text
+    assert f"report: {session.folder / 'report.html'}" in text
+    assert (session.folder / "report.html").read_text() == "verification_due"
 
 
 def test_nothing_is_decided_after_ctrl_c(session: Session, batches: list[Batch], found: None) -> None:
     before = session.plan.certificate.path.read_bytes()
     conduct, _ = conducted(session, list(batches), stopped=True)
     assert conduct.error is None
-    assert conduct.outcome == ""
+    assert conduct.outcome == ()
     assert "certificate.yaml" in session.files
     assert "decision" not in events(session)
     assert session.plan.certificate.path.read_bytes() == before

@@ -10,7 +10,7 @@ import pytest
 
 from calib.detection.acceptance import rejection_reasons
 from calib.detection.segments import find_segments
-from calib.messages import english, message
+from calib.messages import english, message, verbatim
 from calib.procedure.engine import Engine
 from calib.procedure.events import (
     Abort,
@@ -38,7 +38,7 @@ from imudrv.nav.earth import EARTH_RATE
 from imudrv.records import Flag, Records
 from imudrv.sim.scenario import NOMINAL
 from imudrv.site import Site
-from imudrv.units import DEG
+from imudrv.units import ARCSEC, DEG
 
 INTERVAL_NS = 2_000_000
 CHECK_S = 31.0  # the preflight and a little more
@@ -134,14 +134,11 @@ def test_a_step_goes_through_its_phases_by_the_sensors_alone(drive: Drive, turne
 
     assert driver.phases == ["preflight", "place", "settle", "align", "rotate", "rest", "verdict", "done"]
     assert driver.headlines == [
-        "HANDS OFF, CHECKING",
         "HANDS OFF",
-        "HANDS OFF, SETTLING",
-        "HANDS OFF, ALIGNING",
         "ROTATE NOW +180",
         "ROTATE +180",
         "STOP",
-        "HANDS OFF, RESTING",
+        "HANDS OFF",
         "GOOD: STEP 1 OF 1 DONE",
         "ALL STEPS DONE",
     ]
@@ -240,7 +237,7 @@ def test_without_a_confirmation_it_waits_for_ever(drive: Drive, bench: Bench, st
     driver = drive(hands_free=False).feed(bench(step(CHECK_S + 600.0)))
 
     assert driver.phases == ["preflight", "place"]
-    assert english(driver.engine.view.headline) == "READY: CONFIRM"
+    assert english(driver.engine.view.headline) == "PRESS ENTER"
     assert "confirm" in driver.engine.view.actions
 
 
@@ -347,6 +344,56 @@ def test_with_too_few_accepted_steps_the_skipped_ones_are_named(drive: Drive, tu
     assert [type(e) for e in driver.act(Redo("x"))] == [Redone, Entered]
 
 
+@pytest.mark.parametrize("ends", ["key", "motion"])
+def test_a_rejection_stays_for_a_person_until_a_key_or_the_next_motion(
+    ends: str, drive: Drive, bench: Bench, step: Any
+) -> None:
+    wrong = bench(step(CHECK_S + ALIGN_S), step(2.5, -180.0), step(60.0), step(4.0, 180.0), step(2.0))
+    driver = drive(hands_free=False).feed(part(wrong, 0.0, CHECK_S))
+    driver.act(Confirm("z"))
+    driver.feed(part(wrong, CHECK_S, CHECK_S + ALIGN_S + 60.0))
+    rejected = driver.engine.view
+
+    assert rejected.phase is Phase.VERDICT
+    assert reasons(rejected)[0].startswith("wrong direction: -180 deg")
+    assert [english(hint) for hint in rejected.hints] == [
+        "turn it 180 deg counter-clockwise, seen from above"
+    ]
+    if ends == "key":
+        driver.act(Confirm("z"))
+    else:
+        driver.feed(part(wrong, CHECK_S + ALIGN_S + 60.0, 200.0))
+    again = driver.engine.view
+    assert again.phase is Phase.PLACE
+    assert again.reasons == ()
+    assert again.last_try == rejected.reasons
+
+
+def test_a_skip_can_be_taken_back(drive: Drive, turned: Records) -> None:
+    driver = drive(Z, X, Z_BACK, hands_free=False).feed(part(turned, 0.0, CHECK_S))
+    assert "back" not in driver.engine.view.actions
+    driver.act(Skip("z"))
+    driver.act(Skip("x"))
+    assert driver.engine.view.skipped == ("z", "x")
+    assert "back" in driver.engine.view.actions
+    driver.act(Redo("x"))
+    assert (driver.engine.view.step_id, driver.engine.view.skipped) == ("x", ("z",))
+
+
+def test_exchanged_accelerometers_are_suspected_only_after_the_unit_was_lifted(
+    drive: Drive, bench: Bench, step: Any
+) -> None:
+    samples = bench(step(CHECK_S + 60.0), step(4.0, 5.0, (1.0, 0.0, 0.0)), step(20.0))
+    driver = drive(Z, X, hands_free=False).feed(part(samples, 0.0, CHECK_S))
+    driver.act(Skip("z"))
+
+    driver.feed(part(samples, CHECK_S, CHECK_S + 60.0))
+    assert not any("exchanged" in hint for hint in driver.hints)
+
+    driver.feed(part(samples, CHECK_S + 60.0, 200.0))
+    assert any("accelerometers Z and X are exchanged" in hint for hint in driver.hints)
+
+
 def test_an_abort_ends_it(drive: Drive, turned: Records) -> None:
     driver = drive().feed(part(turned, 0.0, CHECK_S + 10.0))
 
@@ -385,7 +432,7 @@ def test_an_accepted_step_without_a_complete_recording_is_repeated(
     driver = drive(*poses).feed(turned)
     newest = int(turned["counter"][-1])
 
-    rejected, entered = driver.engine.reject("z", "the disk is full")
+    rejected, entered = driver.engine.reject("z", verbatim("the disk is full"))
 
     assert isinstance(rejected, Rejected)
     assert (rejected.step_id, rejected.attempt) == ("z", 1)
@@ -398,13 +445,14 @@ def test_an_accepted_step_without_a_complete_recording_is_repeated(
     driver.feed(rest)
     placed = [(e.step_id, e.attempt) for e in driver.of(Entered) if e.phase is Phase.PLACE]
     assert placed == [("z", 1), *[("x", 1) for _ in poses[1:]], ("z", 2)]
-    assert reasons(driver.engine.view) == ["the disk is full"]
+    assert reasons(driver.engine.view) == []
+    assert [english(reason) for reason in driver.engine.view.last_try] == ["the disk is full"]
 
 
 def test_after_an_abort_no_step_is_repeated(drive: Drive, turned: Records) -> None:
     driver = drive(Z, X).feed(turned)
     driver.act(Abort())
-    assert driver.engine.reject("z", "the disk is full") == ()
+    assert driver.engine.reject("z", verbatim("the disk is full")) == ()
 
 
 def test_an_accepted_step_has_its_number_of_samples_without_lost_ones(drive: Drive, turned: Records) -> None:
@@ -695,6 +743,21 @@ def test_temperature_noise_and_faults_are_held_against_the_limits(drive: Drive, 
     assert temperature == "gyro at 48.2 degC, certificate valid from 10 to 40: wait"
     assert noise.startswith("accelerometer noise 2.08 ")
     assert noise.endswith("mg rms at rest, expected at most 0.5: check the bench for vibration")
+
+
+def test_dither_that_the_rate_filter_leaves_is_found_before_the_first_step(
+    drive: Drive, turned: Records
+) -> None:
+    t = np.arange(len(turned)) * 2e-3  # the samples alias 400 Hz to 100 Hz
+    for amplitude_arcsec, count in ((2.0, 0), (10.0, 1)):
+        dithered = turned.copy()
+        dithered["dtheta_b"][:, 1] += np.diff(
+            amplitude_arcsec * ARCSEC * np.sin(2.0 * np.pi * 400.0 * t + 0.3), prepend=0.0
+        )
+        driver = drive().feed(part(dithered, 0.0, CHECK_S))
+        found = [text for one in driver.of(Rejected) for text in reasons(one)]
+        assert len(found) == count
+    assert found[0].startswith("gyro Y carries dither of 10 arcsec at 100 Hz, of which the rate filter ")
 
 
 def test_a_small_motion_before_the_noise_is_known_is_left_out_of_the_check(

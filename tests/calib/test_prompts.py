@@ -2,6 +2,7 @@
 
 import ast
 import json
+import re
 from collections.abc import Iterator
 from dataclasses import asdict
 from importlib import resources
@@ -11,14 +12,10 @@ from string import Formatter
 import pytest
 
 import calib
-from calib.messages import Message, catalogue, english, message, verbatim
+from calib.messages import LANGUAGES, Message, catalogue, english, language, message, text, verbatim
 from calib.procedure.events import Rejected
+from calib.reports.document import MARKS
 
-LANGUAGES = [
-    path.name.removesuffix(".yaml")
-    for path in resources.files("calib.messages").iterdir()
-    if path.name.endswith(".yaml")
-]
 HEADLINE = 38  # characters: what a screen of 80 columns has in letters of three rows
 
 
@@ -36,18 +33,65 @@ def used() -> Iterator[tuple[str, set[str]]]:
                 yield str(key.value), {str(keyword.arg) for keyword in node.keywords}
 
 
+def on_the_page() -> set[str]:
+    """Keys of the labels of the page in a browser."""
+    page = Path(calib.__file__).parent / "bench" / "page"
+    names = set(re.findall(r'data-(?:label|title)="(\w+)"', (page / "index.html").read_text()))
+    for call in re.findall(r"label\(([^()]*)\)", (page / "console.js").read_text()):
+        names |= set(re.findall(r'"(\w+)"', call))
+    return {f"page_{name}" for name in names | set(MARKS)}
+
+
 @pytest.mark.parametrize("language", LANGUAGES)
 def test_the_code_and_every_catalogue_have_the_same_keys_with_the_same_values(language: str) -> None:
     texts = catalogue(language)
     calls = list(used())
 
-    assert {key for key, _ in calls} | {"separator"} == set(texts)
+    assert {key for key, _ in calls} | {"separator"} | on_the_page() == set(texts)
     for key, names in calls:
         assert placeholders(texts[key]) == names, key
 
 
-def test_english_is_among_the_languages() -> None:
-    assert "en" in LANGUAGES
+def test_every_catalogue_is_a_language() -> None:
+    files = resources.files("calib.messages").iterdir()
+    assert {path.name for path in files if path.name.endswith(".yaml")} == {
+        f"{name}.yaml" for name in LANGUAGES
+    }
+
+
+@pytest.mark.parametrize("name", LANGUAGES)
+def test_a_catalogue_has_a_key_once_and_a_line_for_each(name: str) -> None:
+    lines = resources.files("calib.messages").joinpath(f"{name}.yaml").read_text("utf-8").splitlines()
+    keys = [line.partition(": ")[0] for line in lines if line and not line.startswith("#")]
+    assert sorted(set(keys)) == sorted(keys)
+    assert set(keys) == set(catalogue(name))
+
+
+@pytest.mark.parametrize(
+    ("name", "chosen"),
+    [
+        ("zh_CN", "zh_CN"),
+        ("zh-Hans", "zh_CN"),
+        ("zh_CN.UTF-8", "zh_CN"),
+        ("en_GB", "en"),
+        ("fr_FR.UTF-8", "en"),
+        ("C", "en"),
+        ("../../etc/passwd", "en"),
+    ],
+)
+def test_a_language_without_a_catalogue_is_english(
+    name: str, chosen: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert language(name) == chosen
+    monkeypatch.setenv("LC_ALL", name)
+    assert language() == chosen
+
+
+def test_a_journaled_message_is_shown_in_either_language() -> None:
+    entry = json.loads(json.dumps(asdict(message("wrong_direction", angle_deg=-40.0, expected_deg=180))))
+
+    assert text(Message(**entry), "en") == "wrong direction: -40 deg, expected +180"
+    assert text(Message(**entry), "zh_CN") == "方向错误：-40度，应为+180度"
 
 
 def test_values_are_formatted_and_messages_within_a_message_are_rendered() -> None:
@@ -71,9 +115,9 @@ def test_text_from_elsewhere_is_shown_as_it_is() -> None:
 
 def test_headlines_are_readable_from_afar_with_the_longest_values() -> None:
     longest = {"side": "-X", "angle_deg": 180.0, "turn_deg": -180, "step": 100, "steps": 100}
-    for key, text in catalogue("en").items():
-        if "".join(part for part, *_ in Formatter().parse(text)).isupper():
-            shown = english(Message(key, {name: longest[name] for name in placeholders(text)}))
+    for key, template in catalogue("en").items():
+        if "".join(part for part, *_ in Formatter().parse(template)).isupper():
+            shown = english(Message(key, {name: longest[name] for name in placeholders(template)}))
             assert len(shown) <= HEADLINE, shown
             assert shown.isascii()
 

@@ -10,15 +10,18 @@ import numpy as np
 import pytest
 from rich.cells import cell_len
 
-from calib.estimation.result import LeaveOneOut
+from calib.estimation.dither_line import DitherLine
+from calib.estimation.result import ChiSquare, LeaveOneOut
 from calib.identification import IdentificationResult, PriorCalibration, identify
 from calib.lever_arms.gauge import LeverArms, convert
-from calib.reports.identification import arms_text, document, report_html, verdict
+from calib.messages import english
+from calib.reports.identification import arms_text, document, report_html, terminal_document
 from calib.reports.text import as_text
+from calib.reports.verdict import verdict
 from imudrv.cli import main as imudrv
 from imudrv.sim.scenario import NOMINAL
 from imudrv.site import Site
-from imudrv.units import MM
+from imudrv.units import ARCSEC, MM
 
 HOSTILE = "<img src=x onerror=alert(1)>&\x1b[31m$\\frac{长名字}$" + 60 * "z"
 SCENARIO = """
@@ -36,6 +39,10 @@ motion:
 unit:
   noise: {{arw_deg_per_sqrt_h: 0.002, vrw_m_s_per_sqrt_h: 0.003}}
 """
+
+
+def verdict_texts(identification: IdentificationResult) -> list[tuple[str, str]]:
+    return [(mark, english(text)) for mark, text in verdict(identification)]
 
 
 @pytest.fixture(scope="module")
@@ -118,6 +125,18 @@ def test_text_from_files_is_escaped(
     assert "\x1b" not in as_text(document(identification, arms))
 
 
+def test_on_a_terminal_the_verdict_is_last_and_the_rest_only_on_request(
+    identification: IdentificationResult, arms: tuple[LeverArms, LeverArms]
+) -> None:
+    short = as_text(terminal_document(identification, arms))
+    last = short.rstrip().splitlines()[-8:]
+    assert any(line.strip().startswith("good") for line in last)
+    assert len(short.splitlines()) < 45  # a screen, of the 258 lines of the whole
+    whole = as_text(terminal_document(identification, arms, verbose=True))
+    assert whole.index("THE ESTIMATE") < whole.index("RESULT")
+    assert whole.rstrip().splitlines()[-8:] == last
+
+
 def test_the_text_fits_80_columns_whatever_the_names(
     identification: IdentificationResult, arms: tuple[LeverArms, LeverArms]
 ) -> None:
@@ -160,46 +179,95 @@ def test_every_rotation_has_a_verdict_or_a_reason_for_rejection(
     assert text.count("turned 30.0 deg, want 180 +- 5") == 3
 
 
-def test_the_verdict_is_bad_where_the_data_contradict_the_model(identification: IdentificationResult) -> None:
-    n = identification.result.degrees_of_freedom
-    marks = {}
+def marks_of(identification: IdentificationResult, **changes: object) -> list[tuple[str, str]]:
+    result = replace(identification.result, **changes)  # type: ignore[arg-type]
+    return verdict_texts(replace(identification, result=result))
+
+
+def test_the_verdict_is_that_of_the_worst_test(identification: IdentificationResult) -> None:
+    n, marks = 200, {}
     for ratio in (0.5, 1.0, 1.5, 3.0):
-        result = replace(identification.result, chi_square=ratio * n)
-        marks[ratio] = list(verdict(replace(identification, result=result)))[1]
-    assert [marks[ratio][0] for ratio in marks] == ["note", "good", "caution", "bad"]
-    assert "by a factor of 1.22" in marks[1.5][1]
-    assert "No certificate is made" in marks[3.0][1]
+        marks[ratio] = marks_of(identification, scatter=ChiSquare(ratio * n, n), redundancy=ChiSquare(6.0, 6))
+    assert [marks[ratio][0][0] for ratio in marks] == ["note", "note", "caution", "bad"]  # skew: a note
+    scatter = [next(mark for mark in found if mark[1].startswith("Scatter")) for found in marks.values()]
+    assert [mark for mark, _ in scatter] == ["note", "good", "caution", "caution"]
+    assert "by a factor of 1.22" in scatter[2][1]
+    assert "No certificate is made" in marks[3.0][1][1]
+
+
+@pytest.mark.parametrize(("value", "level"), [(0.2, "note"), (6.0, "good"), (16.0, "caution"), (40.0, "bad")])
+def test_rotations_that_disagree_are_a_caution_or_bad(
+    identification: IdentificationResult, value: float, level: str
+) -> None:
+    marks = marks_of(identification, redundancy=ChiSquare(value, 6))
+    (found,) = (mark for mark in marks if mark[1].startswith("Redundancy"))
+    assert found[0] == level
+    assert f"chi-square {value:.1f} with 6 degrees of freedom, 95 % band 1.2 to 14.4" in found[1]
 
 
 def test_dither_in_the_increments_is_a_bad_verdict_with_the_remedy(
     identification: IdentificationResult,
 ) -> None:
     runs = identification.result.runs
-    shaken = replace(identification.result, runs=(replace(runs[0], H_rest=0.07), *runs[1:]))
-    bad = [text for mark, text in verdict(replace(identification, result=shaken)) if mark == "bad"]
+    shaken = replace(runs[0], H_rest=0.07, lines=(DitherLine("X", 150.0, 3.0 * ARCSEC),))
+    marks = marks_of(identification, runs=(shaken, *runs[1:]), dither_error=8.0)
+    bad = [text for mark, text in marks[1:] if mark == "bad"]
     assert len(bad) == 1
-    assert bad[0].startswith("The gyro increments carry dither or vibration: expected H of at most 0.002")
-    assert "got 0.07 (" in bad[0]
+    assert bad[0].startswith("The gyro increments carry dither or vibration (3 arcsec at 150 Hz about X)")
+    assert "H is 0.07 m/s per m" in bad[0]
+    assert "which costs 8 sigma, expected at most 0.1" in bad[0]
     assert "let the unit remove its dither" in bad[0]
 
 
-def test_three_rotations_give_no_false_caution(identification: IdentificationResult) -> None:
-    marks = list(verdict(identification))
-    assert {mark for mark, _ in marks} == {"good", "note"}
+def test_three_rotations_are_noted_as_not_checked(identification: IdentificationResult) -> None:
+    marks = verdict_texts(identification)
+    assert {mark for mark, _ in marks} <= {"good", "note"}
+    overall, text = marks[0]
+    assert overall == "note"
+    assert "determined by 3 rotations" in text
+    assert "Tested: the scatter at rest (" in text
+    assert "agreement" not in text
     notes = " ".join(text for mark, text in marks if mark == "note")
-    assert "determined but not checked: no rotation is redundant" in notes
+    assert "Arms determined, not checked: no redundant rotation" in notes
     assert "include one of 0.5 ms" in notes
-    assert "agree with the model" not in " ".join(text for _, text in marks)
 
 
-def test_the_change_without_a_redundant_rotation_is_reported(identification: IdentificationResult) -> None:
+@pytest.mark.parametrize(("p_shift", "level"), [(2.0, "good"), (20.0, "caution")])
+def test_each_rotation_is_judged_against_its_own_sigma(
+    identification: IdentificationResult, p_shift: float, level: str
+) -> None:
     shift = np.zeros((3, 3))
     shift[1, 2] = -0.02 * MM
-    result = replace(
-        identification.result, leave_one_out=(LeaveOneOut("z#1", 6, shift), LeaveOneOut("x#1", 4, None))
+    marks = marks_of(
+        identification,
+        redundancy=ChiSquare(6.0, 6),
+        leave_one_out=(
+            LeaveOneOut("z", 6, shift, np.full((3, 3), 0.01 * MM), ChiSquare(p_shift, 2)),
+            LeaveOneOut("x", 4, None, None, None),
+        ),
     )
-    notes = [text for mark, text in verdict(replace(identification, result=result)) if mark == "note"]
-    assert notes[0] == "Omitting one rotation changes no component by more than 0.020 mm (z#1)."
+    (found,) = (mark for mark in marks if mark[1].startswith("Omitting"))
+    assert found[0] == level
+    assert (
+        "z, which fits worst, changes a component by 0.0200 mm, standard uncertainty of that 0.0100 mm"
+        in (found[1])
+    )
+
+
+@pytest.mark.parametrize(
+    ("site", "text"),
+    [
+        ({"latitude_deg": 29.2}, "the site's is 29.20 deg"),
+        ({"gravity_m_s2": 9.7970}, "gravity at the site 9.79700 m/s^2"),
+    ],
+)
+def test_a_site_that_the_alignment_contradicts_is_a_caution(
+    identification: IdentificationResult, site: dict[str, float], text: str
+) -> None:
+    assert not any("check the site" in sentence for _, sentence in verdict_texts(identification))
+    wrong = replace(identification, site=identification.site.model_copy(update=site))
+    cautions = [sentence for mark, sentence in verdict_texts(wrong) if mark == "caution"]
+    assert sum(text in sentence for sentence in cautions) == 3
 
 
 def test_digits_follow_the_uncertainty(identification: IdentificationResult) -> None:

@@ -5,18 +5,20 @@ import pty
 import sys
 import termios
 from collections.abc import Iterator
-from io import StringIO
+from dataclasses import replace
+from io import BytesIO, StringIO, TextIOWrapper
 from threading import Event
 from typing import Any
 
 import pytest
 from realtime import DEADLINE_S, until
+from rich.cells import cell_len
 from rich.console import Console
 
 from calib.bench import block_letters
 from calib.bench.keys import Keyboard
-from calib.bench.screen import NO_DATA, NO_FRAMES, OperatorScreen, plain, screen, with_port_state
-from calib.messages import english, verbatim
+from calib.bench.screen import NO_DATA, NO_FRAMES, OperatorScreen, large_text, plain, screen, with_port_state
+from calib.messages import english, message, verbatim
 from calib.procedure.events import Abort, Confirm, Phase, Redo, Skip, View
 from imudrv.diagnosis import LineState
 
@@ -27,7 +29,7 @@ LONG = (
 HEADLINES = (
     "TURN IT: X UP",
     "TURN IT 180 DEG COUNTER-CLOCKWISE",
-    "HANDS OFF, ALIGNING",
+    "HANDS OFF 5:54",
     "ROTATE NOW +180",
     "ROTATE NOW -180",
     "FASTER",
@@ -46,6 +48,11 @@ def view(phase: Phase = Phase.PLACE, headline: str = "TURN IT: X UP", **changes:
         "title": "step 2 of 3: X up, +180 deg",
         "hints": (),
         "reasons": (),
+        "last_try": (),
+        "accepted": (),
+        "skipped": (),
+        "C_nb": None,
+        "force_m_s2": None,
         "angle_deg": None,
         "want_deg": None,
         "rate_deg_per_s": 0.0,
@@ -54,11 +61,11 @@ def view(phase: Phase = Phase.PLACE, headline: str = "TURN IT: X UP", **changes:
         "remaining_s": None,
         "level_sigma_deg": None,
         "heading_sigma_deg": None,
-        "actions": ("confirm", "redo", "skip", "abort"),
+        "actions": ("confirm", "redo", "skip", "back", "abort"),
         "bells": 0,
     }
     values |= changes
-    for name in ("hints", "reasons"):
+    for name in ("hints", "reasons", "last_try"):
         values[name] = tuple(map(verbatim, values[name]))
     values["title"] = verbatim(values["title"])
     return View(phase=phase, headline=verbatim(headline), **values)
@@ -126,13 +133,12 @@ def test_bars_figures_and_reasons_are_on_the_screen() -> None:
     )
     for words in (
         "step 2 of 3: X up, +180 deg",
-        "ROTATE 1:15",
         "+90.0 of +180 deg",
         "44 deg/s",
         "moving",
         "level 0.0031 deg, heading 0.0821 deg",
         "turned 148.3 deg, want 180 +- 5",
-        "Enter: confirm   r: redo   s: skip   q: abort",
+        "Enter: confirm   r: redo   s: skip   b: back to the skipped step   q: abort",
     ):
         assert words in text
     bar = next(row for row in text.splitlines() if row.startswith("angle"))
@@ -140,7 +146,7 @@ def test_bars_figures_and_reasons_are_on_the_screen() -> None:
 
 
 def test_a_question_replaces_the_keys() -> None:
-    assert rows(view(), question="once more: abort")[-1] == "once more: abort"
+    assert rows(view(), question=verbatim("once more: abort"))[-1] == "once more: abort"
 
 
 @pytest.mark.parametrize(
@@ -167,9 +173,67 @@ def test_what_is_wrong_with_the_line_is_shown_and_without_samples_it_is_the_head
     assert state.trouble in "\n".join(rows(shown))
 
 
+def test_the_countdown_is_in_the_large_text_while_one_waits() -> None:
+    shown = replace(view(Phase.ALIGN, remaining_s=354.0), headline=message("hands_off"))
+    assert large_text(shown) == "HANDS OFF 5:54"
+    turning = replace(view(Phase.ROTATE, remaining_s=354.0), headline=message("rotate", turn_deg=180))
+    assert large_text(turning) == "ROTATE +180"
+
+
+def test_a_rejection_has_one_reason_and_one_remedy_in_the_largest_letters_and_then_a_grey_last_try() -> None:
+    slow = message("too_slow", peak_deg_per_s=40.0, limit_deg_per_s=60.0)
+    angle = message("wrong_angle", angle_deg=150.0, expected_deg=180.0, tolerance_deg=5.0)
+    rejected = replace(
+        view(Phase.VERDICT),
+        headline=message("rejected"),
+        hints=(message("remedy_time", shortest_s=2.0, longest_s=3.0),),
+        reasons=(slow, angle),
+    )
+    drawn = rows(rejected)
+    text = "\n".join(drawn)
+    assert len(drawn) == 23
+    assert "peak 40 deg/s: slower than 60" in text
+    assert "turn it in 2 to 3 s" in text
+    assert "turned 150.0 deg" not in text
+    assert sum("█" in row for row in drawn) >= 10  # of the letters; there are no bars
+
+    again = replace(view(Phase.PLACE), last_try=(slow, angle))
+    assert "last try: peak 40 deg/s: slower than 60" in "\n".join(rows(again))
+    assert len(rows(again)) == 23
+
+
 def test_a_terminal_without_blocks_gets_ascii() -> None:
     for headline in HEADLINES:
         assert "\n".join(rows(view(headline=headline, progress=0.3), ascii_only=True)).isascii()
+
+
+def test_in_chinese_the_large_letters_stay_ascii_and_the_headline_is_repeated_below() -> None:
+    shown = replace(
+        view(Phase.ALIGN, remaining_s=75.0),
+        headline=message("hands_off"),
+        hints=(message("do_not_touch"),),
+        reasons=(message("alignment_interrupted", elapsed_s=8.4, cause=message("unit_restarted")),) * 4,
+    )
+    out = StringIO()
+    console = Console(file=out, width=80, height=24, color_system=None)
+    console.print(screen(shown, 80, 24, language="zh_CN"))
+    drawn = out.getvalue().splitlines()
+
+    assert len(drawn) == 23
+    assert max(map(cell_len, drawn)) <= 80
+    assert drawn[0].endswith("对准")
+    assert "请勿触碰" in drawn
+    assert drawn[-1] == "Enter: 确认   r: 重做   s: 跳过   b: 返回跳过的步骤   q: 中止"
+    assert not any("请" in row for row in drawn[1:10])  # the large letters
+
+
+def test_a_terminal_of_ascii_gets_english() -> None:
+    out = TextIOWrapper(BytesIO(), "ascii")
+    shown = OperatorScreen(Console(file=out, width=80), "zh_CN")
+    shown.say(message("computing"))
+    shown.close()
+    out.seek(0)
+    assert out.read() == "Computing the lever arms from the recordings ...\n"
 
 
 def test_without_a_terminal_each_change_is_a_line() -> None:
@@ -178,7 +242,7 @@ def test_without_a_terminal_each_change_is_a_line() -> None:
     shown.show(view(rate_deg_per_s=20.0, hints=("roll it over",)))
     shown.show(view(rate_deg_per_s=30.0, hints=("roll it over",), bells=1))
     shown.show(view(Phase.VERDICT, "REJECTED: DO IT AGAIN", reasons=("turned 150.0 deg, want 180 +- 5",)))
-    shown.show(view(Phase.VERDICT, "REJECTED: DO IT AGAIN"), question="once more: abort")
+    shown.show(view(Phase.VERDICT, "REJECTED: DO IT AGAIN"), question=verbatim("once more: abort"))
     shown.close()
     assert out.getvalue().splitlines() == [
         "step 2 of 3: X up, +180 deg | place: TURN IT: X UP | roll it over",
@@ -302,9 +366,12 @@ def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[Terminal]:
     ("key", "action"),
     [
         (b"\n", Confirm("x-up")),
-        (b"r", Redo("x-up")),
-        (b"S", Skip("x-up")),
+        (b"ry", Redo("x-up")),
+        (b"SY", Skip("x-up")),
+        (b"by", Redo("z-up")),
+        (b"qy", Abort()),
         (b"x", None),
+        (b"y", None),
         (b"\x1b[A", None),
     ],
 )
@@ -314,7 +381,7 @@ def test_a_key_asks_for_the_step_that_is_on_the_screen(
     with Keyboard() as keys:
         assert keys.action(view()) is None
         terminal.type(key)
-        assert keys.action(view()) == action
+        assert keys.action(view(skipped=("y-up", "z-up"))) == action
 
 
 def test_a_key_that_makes_no_sense_now_does_nothing(terminal: Terminal) -> None:
@@ -323,18 +390,33 @@ def test_a_key_that_makes_no_sense_now_does_nothing(terminal: Terminal) -> None:
         assert keys.action(view(actions=("skip",))) is None
 
 
-def test_q_aborts_only_when_it_is_pressed_twice_in_a_row(terminal: Terminal) -> None:
+@pytest.mark.parametrize(
+    ("key", "question"), [("r", "ask_redo"), ("s", "ask_skip"), ("b", "ask_back"), ("q", "ask_abort")]
+)
+def test_what_gives_work_up_is_asked_and_only_y_confirms_it(
+    terminal: Terminal, key: str, question: str
+) -> None:
+    shown = view(skipped=("z-up",))
     with Keyboard() as keys:
-        terminal.type(b"q")
+        for answer in ("n", "x", key, "\n"):
+            terminal.type(key.encode())
+            assert keys.action(shown) is None
+            assert keys.question == message(question)
+            terminal.type(answer.encode())
+            assert keys.action(shown) is None
+            assert keys.question is None
+        terminal.type(key.encode())
+        keys.action(shown)
+        terminal.type(b"y")
+        assert keys.action(shown) is not None
+
+
+def test_an_answer_that_comes_in_another_step_does_nothing(terminal: Terminal) -> None:
+    with Keyboard() as keys:
+        terminal.type(b"s")
         assert keys.action(view()) is None
-        assert keys.asks
-        terminal.type(b"x")
-        assert keys.action(view()) is None
-        assert not keys.asks
-        terminal.type(b"q")
-        assert keys.action(view()) is None
-        terminal.type(b"q")
-        assert keys.action(view()) == Abort()
+        terminal.type(b"y")
+        assert keys.action(view(step_id="y-up")) is None
 
 
 def test_keys_are_read_without_enter_and_the_terminal_is_given_back_as_it_was(terminal: Terminal) -> None:

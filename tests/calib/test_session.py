@@ -327,8 +327,8 @@ def test_every_entry_of_an_older_journal_is_read_and_written_back_the_same(tmp_p
             line = {"reasons": [line["reason"]], **{k: v for k, v in line.items() if k != "reason"}}
         if "reasons" in line:
             again["reasons"] = [english(Message(**reason)) for reason in again["reasons"]]
-        # `samples` and `turns` of an accepted step and `left` of each file are newer.
-        newer = "samples", "turns", "turns_within_limits", "left"
+        # `samples` and `turns` of an accepted step, `left` of each file, and who calibrates are newer.
+        newer = "samples", "turns", "turns_within_limits", "left", "bench", "operator", "host"
         new = {key for key in newer if key in again and key not in line}
         assert {k: v for k, v in again.items() if k not in new} == line
 
@@ -618,18 +618,17 @@ def test_a_session_with_a_damaged_recording_is_not_resumed(session: Session, acc
 
 @pytest.mark.parametrize("answer", ["y", "n"])
 def test_a_session_is_resumed_only_after_the_operator_confirms(
-    session: Session, accept: Accept, monkeypatch: pytest.MonkeyPatch, answer: str
+    session: Session, accept: Accept, answer: str
 ) -> None:
     accept(session, "z-up")
     shown, before = StringIO(), len(session.entries)
-    monkeypatch.setattr("builtins.input", lambda *_: answer)
     console = Console(file=shown, width=200)
     if answer == "n":
         with pytest.raises(InputError, match="not resumed and not changed"):
-            resume(session, console, ["z-up"], asks=True)
+            resume(session, console, ["z-up"], "en", lambda: answer == "y")
         assert len(session.entries) == before
     else:
-        resume(session, console, ["z-up"], asks=True)
+        resume(session, console, ["z-up"], "en", lambda: answer == "y")
         assert events(session)[before:] == ["redone", "resumed"]
     assert "of unit nominal: accepted steps: z-up" in shown.getvalue()
     assert "resume it? [y/n]" in shown.getvalue()

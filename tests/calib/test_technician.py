@@ -11,7 +11,7 @@ import pytest
 from calib.bench.technician import Mistake, technician_scenario
 from calib.estimation.joint import estimate_joint
 from calib.estimation.result import TO_DIFFERENCES, LeverArmEstimate
-from calib.estimation.runs import NavigationOptions, navigate_rotations
+from calib.estimation.runs import NavigationOptions, Pulses, navigate_rotations
 from calib.messages import english
 from calib.procedure.engine import Engine
 from calib.procedure.events import Accepted, Event, Finished, Phase, Rejected, Restarted, Turned
@@ -53,6 +53,7 @@ class Performance:
         """From the samples that the accepted events name, as from a recording."""
         calibration = self.scenario.unit.calibration
         assert calibration is not None
+        known = coefficients(calibration)
         runs = []
         for step in self.procedure.steps:
             accepted = self.engine.accepted[step.id]
@@ -64,6 +65,7 @@ class Performance:
                 self.scenario.site,
                 step.id,
                 NavigationOptions(self.procedure.rotation_limits(step), expected=step.up[1]),
+                Pulses(known.gyro_scale, 1.0 / known.accelerometer_scale, np.linalg.inv(known.C_bg)),
             )
             assert len(navigated.runs) == 1
             outside = [r for r, _ in navigated.rejected if abs(r.angle_deg) > 10.0]  # a bump is no turn

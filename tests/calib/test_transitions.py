@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from calib.messages import verbatim
 from calib.procedure.engine import Engine
 from calib.procedure.events import Abort, Action, Confirm, Entered, Phase, Redo, Skip
 from calib.procedure.phases import STATES
@@ -140,6 +141,6 @@ def test_a_step_without_a_complete_recording_is_repeated_in_every_phase_after_it
 ) -> None:
     for phase in (Phase.VERDICT, Phase.DONE):
         engine = deepcopy(engines[phase])
-        engine.reject("z", "the disk is full")
+        engine.reject("z", verbatim("the disk is full"))
         assert engine.view.phase is TRANSITIONS[phase, Outcome.REJECTED]
         assert engine.accepted == {}

@@ -12,12 +12,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from imudrv.errors import InputError
 from imudrv.imu.coefficients import Coefficients, TemperatureTerms
 from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import NAMES, RateFilter, RateFilterName, rate_filter
 from imudrv.profiles import load
 from imudrv.records import INCREMENTS, PULSES, Flag, Records
-from imudrv.units import ARCSEC, DEG_PER_H, PPM, UG
+from imudrv.units import ARCSEC, DEG_PER_H, PPM, STANDARD_GRAVITY, UG
 
 RS422 = load("imu50-rs422").layout()
 TOTALS = load("imu50-rs422-acc").layout()
@@ -307,3 +308,119 @@ def test_one_temperature_of_all_accelerometers_serves_each():
     pulses["temperature_degc"][:, 2] = -273.0  # of the electronics: counts for nothing
     mean = Compensator(CALIBRATION, TOTALS, "causal").feed(pulses)
     assert same_bits(each, mean)
+
+
+# Quadratic term, asymmetry and skew of the accelerometers
+
+TERMS = {
+    "quadratic": np.array([15.0, -40.0, 25.0]) * UG / STANDARD_GRAVITY**2,
+    "asymmetry": np.array([-30.0, 20.0, 50.0]) * PPM,
+}
+PLAIN = replace(CALIBRATION, r_b=None, temperature=None)
+
+
+def velocities(pulses: Records, c: Coefficients) -> np.ndarray:
+    """Velocities on the sensing axes by the contract: N/K - b T - k2 f^2 T - |f| T / 2, then the skew."""
+    T = 1e-9 * pulses["interval_ns"][:, None]
+    e = pulses["accelerometer"] / c.accelerometer_scale - c.accelerometer_bias * T
+    f = e / T
+    e = e - c.quadratic * f**2 * T - 0.5 * c.asymmetry * np.abs(f) * T
+    f = e / T
+    out = e.copy()
+    for i in range(1, len(pulses)):
+        if not pulses["flags"][i] & Flag.MISSING_BEFORE:
+            out[i if c.skew_s > 0 else i - 1] -= c.skew_s * (f[i] - f[i - 1])
+    return out
+
+
+@pytest.mark.parametrize(("skew_s", "name"), [(3e-4, "causal"), (3e-4, "dither"), (-4e-4, "centred")])
+def test_the_terms_are_those_of_the_contract(skew_s, name):
+    c = replace(PLAIN, **TERMS, skew_s=skew_s)
+    expected = velocities(PULSES_OF_ALL_KINDS, c) @ c.C_ba.T
+    got = compensate(PULSES_OF_ALL_KINDS, c, name)
+    assert got["counter"].tolist() == PULSES_OF_ALL_KINDS["counter"].tolist()
+    # Velocities of a pulse, 6e-4 m/s, rounded a few times.
+    assert np.abs(got["dv_b"] - expected).max() < 1e-17
+    assert np.abs(expected - velocities(PULSES_OF_ALL_KINDS, PLAIN) @ c.C_ba.T).max() > 1e-5
+
+
+@pytest.mark.parametrize("skew_s", [2e-4, -2e-4])
+@pytest.mark.parametrize("name", list(FILTERS))
+@pytest.mark.parametrize("with_arms", [True, False])
+def test_any_pieces_give_the_same_bits_with_all_terms(skew_s, name, with_arms):
+    c = replace(CALIBRATION, **TERMS, skew_s=skew_s, r_b=CALIBRATION.r_b if with_arms else None)
+    whole = compensate(PULSES_OF_ALL_KINDS, c, name)
+    cuts = [1, 2, 3, 59, 60, 61, 62, 150, 151, 152, 153, 299, 300, 301]
+    assert same_bits(compensate(PULSES_OF_ALL_KINDS, c, name, cuts), whole)
+    assert same_bits(compensate(PULSES_OF_ALL_KINDS, c, name, list(range(1, 400))), whole)
+
+
+@pytest.mark.parametrize("skew_s", [2e-4, -2e-4])
+def test_the_size_effect_is_that_without_a_skew(skew_s):
+    # It comes from the gyros: the skew moves what the accelerometers sense, and nothing else.
+    skewed = replace(CALIBRATION, skew_s=skew_s)
+    with_arms, bare = (
+        compensate(PULSES_OF_ALL_KINDS, c, "centred") for c in (skewed, replace(skewed, r_b=None))
+    )
+    plain, plain_bare = (
+        compensate(PULSES_OF_ALL_KINDS, c, "centred") for c in (CALIBRATION, replace(CALIBRATION, r_b=None))
+    )
+    difference = (with_arms["dv_b"] - bare["dv_b"]) - (plain["dv_b"] - plain_bare["dv_b"])
+    assert np.abs(difference).max() < 1e-16  # rounding
+
+
+@pytest.mark.parametrize("skew_s", [7e-4, -7e-4])
+def test_the_part_of_the_skew_telescopes(skew_s):
+    pulses = PULSES_OF_ALL_KINDS[:150]
+    c = replace(PLAIN, skew_s=skew_s)
+    skewed, plain = (compensate(pulses, one, "centred")["dv_b"].sum(axis=0) for one in (c, PLAIN))
+    T = 1e-9 * pulses["interval_ns"][[0, -1], None]
+    ends = pulses["accelerometer"][[0, -1]] / c.accelerometer_scale / T
+    # 150 roundings of 1e-3 m/s
+    assert np.abs(skewed - plain + c.C_ba @ (skew_s * (ends[1] - ends[0]))).max() < 1e-16
+
+
+@pytest.mark.parametrize("skew_s", [1.5e-4, 6e-4, -6e-4])
+def test_a_turn_in_gravity_loses_its_skew(skew_s):
+    # Accelerometers that sample a turn of 3 rad/s late by the skew: what is left is of second order in it.
+    n, tau = 2000, 1e-9 * TAU_NS
+    t = tau * np.arange(n + 1)
+
+    def sensed(late: float) -> np.ndarray:
+        angle = 3.0 * (t + late)
+        integral = STANDARD_GRAVITY / 3.0 * np.stack([-np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+        return np.diff(np.rint(1e9 * integral), axis=0)
+
+    pulses = np.zeros(n, PULSES)
+    pulses["counter"], pulses["interval_ns"] = np.arange(n), TAU_NS
+    fine = replace(PLAIN, accelerometer_scale=np.full(3, 1e9), accelerometer_bias=np.zeros(3), C_ba=np.eye(3))
+    pulses["accelerometer"] = sensed(0.0)
+    true = compensate(pulses, fine, "centred")["dv_b"]
+    pulses["accelerometer"] = sensed(skew_s)
+    left = compensate(pulses, replace(fine, skew_s=skew_s), "centred")["dv_b"] - true
+    wrong = compensate(pulses, fine, "centred")["dv_b"] - true
+    # f'' = 9 g; linear interpolation between intervals leaves |s| (tau - |s|) / 2 f'' tau, 1.1e-8 m/s
+    assert np.abs(left[1:-1]).max() < 1.3e-8
+    assert np.abs(wrong[1:-1]).max() > 400 * abs(skew_s) * 1e-8
+
+
+def test_a_filter_without_lag_leaves_out_a_negative_skew_and_says_so():
+    c = replace(CALIBRATION, skew_s=-3e-4)
+    causal, centred = Compensator(c, RS422, "causal"), Compensator(c, RS422, "centred")
+    assert (causal.leaves_out_skew, centred.leaves_out_skew) == (True, False)
+    assert not Compensator(replace(c, skew_s=3e-4), RS422, "causal").leaves_out_skew
+    assert same_bits(causal.feed(PULSES_OF_ALL_KINDS), compensate(PULSES_OF_ALL_KINDS, CALIBRATION, "causal"))
+
+
+def test_a_negative_skew_without_arms_comes_one_sample_later():
+    compensator = Compensator(replace(PLAIN, skew_s=-3e-4), RS422, "centred")
+    assert compensator.lag == 1
+    counts = [len(compensator.feed(PULSES_OF_ALL_KINDS[a:b])) for a, b in itertools.pairwise((0, 1, 5, 5, 9))]
+    assert counts == [0, 4, 0, 4]
+    assert len(compensator.close()) == 1
+
+
+def test_a_skew_longer_than_an_interval_is_refused():
+    words = r"skew_ms: expected at most a sample interval of .*, 1 ms, got 1\.2 ms"
+    with pytest.raises(InputError, match=words):
+        Compensator(replace(CALIBRATION, skew_s=1.2e-3), RS422)

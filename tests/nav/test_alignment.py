@@ -204,7 +204,7 @@ def test_a_moved_platform_is_caught_with_time_and_size(what: str) -> None:
     sentence = (
         rf"moved 100 to 105 s after the start: {expected}.*limit .*8 times the quietest fifth.*align again"
     )
-    assert re.search(sentence, motion)
+    assert re.search(sentence, str(motion))
 
 
 @pytest.mark.parametrize(

@@ -39,7 +39,7 @@ def test_the_three_poses_of_the_bench_procedure_are_shipped() -> None:
 
 def test_an_unknown_name_is_reported_with_the_known_ones() -> None:
     with pytest.raises(
-        InputError, match=r"scenario 'w-up': expected one of rocking, .*there is no such file"
+        InputError, match=r"scenario 'w-up': expected one of long-rest, .*there is no such file"
     ):
         load("w-up")
 
@@ -63,7 +63,7 @@ def test_a_missing_calibration_file_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("motion", "sections", "message"),
     [
-        ({}, {}, "expected one of rest, rotate, turns, rock, vibrate, got none"),
+        ({}, {}, "expected one of rest, rotate, carry, turns, rock, vibrate, got none"),
         (
             {"rest": {"duration_s": 1.0}, "rotate": {"angle_deg": 1.0, "duration_s": 1.0}},
             {},

@@ -12,7 +12,7 @@ from imudrv.imu.coefficients import Coefficients
 from imudrv.nav.earth import earth_rate_n
 from imudrv.sim.scenario import NOMINAL, Scenario
 from imudrv.sim.unit import Chunk, draw_true_unit, simulate
-from imudrv.units import ARCSEC, DEG, DEG_PER_H, DEG_PER_SQRT_H, PPM, UG, URAD
+from imudrv.units import ARCSEC, DEG, DEG_PER_H, DEG_PER_SQRT_H, PPM, STANDARD_GRAVITY, UG, URAD
 from imudrv.wire.layout import Layout
 
 Make = Callable[..., Scenario]
@@ -60,6 +60,9 @@ FINE = {
 }
 
 
+NOT_LINEAR = {"quadratic_ug_per_g2": [30.0, -50.0, 20.0], "asymmetry_ppm": [-40.0, 10.0, 60.0]}
+
+
 def run(scenario: Scenario, interval_ns: int = MS, chunk: int = 65_536) -> Chunk:
     chunks = list(simulate(scenario, replace(LAYOUT, interval=Fraction(interval_ns)), chunk))
     return Chunk(np.concatenate([c.pulses for c in chunks]), np.concatenate([c.truth for c in chunks]))
@@ -86,13 +89,14 @@ def size_effect(unit: Coefficients, got: Chunk) -> np.ndarray:
 
 def test_pulses_converted_by_the_calibration_are_the_truth(scenario: Make) -> None:
     hot = {"start_degc": 40.0, "slope_k_per_h": 900.0}
+    calibration = {**FINE, "accelerometer": {**FINE["accelerometer"], **NOT_LINEAR}}
     got = run(
         scenario(
             REST,
             TURN,
             ROCK,
             REST,
-            unit={"calibration": FINE, "temperature": hot},
+            unit={"calibration": calibration, "temperature": hot},
             start={"pivot_offset_mm": [40, 30, 20]},
         )
     )
@@ -103,7 +107,9 @@ def test_pulses_converted_by_the_calibration_are_the_truth(scenario: Make) -> No
     dtheta_b = (k_g * got.pulses["gyro"]) @ np.array(FINE["gyro"]["C_bg"]).T - b_g * tau
     K = np.array([2e6, 3e6, 1e6]) * (1 + warmer * np.array([-10, 20, 40]) * PPM)
     b = (np.array([1000, -2000, 500]) + warmer * np.array([100, 200, -100])) * UG
-    dv_a = got.pulses["accelerometer"] / K - b * tau - size_effect(unit, got)
+    e = got.pulses["accelerometer"] / K - b * tau
+    square = np.array([30, -50, 20]) * UG / STANDARD_GRAVITY**2 * e**2 / tau
+    dv_a = e - square - 0.5 * np.array([-40, 10, 60]) * PPM * np.abs(e) - size_effect(unit, got)
     dv_b = dv_a @ np.array(FINE["accelerometer"]["C_ba"]).T
     # half a pulse at each end of a sum: of 0.002 arcsec and 1e-6 m/s, mixed a little by the axes
     angle, speed = 2 * 0.002 * ARCSEC, 2e-6

@@ -90,7 +90,7 @@ def test_an_existing_file_is_not_changed(tmp_path: Path) -> None:
     [
         ("file:out.npz", "export the recording"),
         ("file:/no/such/folder/out.csv", "cannot be written: No such file"),
-        ("http://somewhere", "expected udp:, tcp:, serial:, can:, file: at the start, got 'http'"),
+        ("http://somewhere", "expected udp:, tcp:, serial:, can:, zenoh:, file: at the start, got 'http'"),
     ],
 )
 def test_an_invalid_output_is_refused(url: str, told: str) -> None:

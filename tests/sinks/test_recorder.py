@@ -83,7 +83,11 @@ def test_the_library_itself_reads_all_that_was_recorded(batch, tmp_path: Path) -
     assert [m.sequence for m in wire] == list(range(20))
     increments = b"".join(m.data for _, c, m in messages if c.topic == "/imu50/increments")
     assert increments == batch(0, 20).datagrams
-    documents = {c.topic: (s.encoding, json.loads(m.data)) for s, c, m in messages if s}
+    documents = {
+        c.topic: (s.encoding, json.loads(m.data))
+        for s, c, m in messages
+        if s and c.message_encoding == "json"
+    }
     assert documents["/imu50/status"] == ("jsonschema", {"rate_hz": 1000.0, "path": "x"})
     assert documents["/imu50/events"] == ("jsonschema", {"text": "unplugged"})
     with path.open("rb") as file:

@@ -169,4 +169,4 @@ def decode(path: Path, profile: str | None) -> None:
 
 def convert(path: Path, kind: str, out: Path) -> None:
     """Export a recording."""
-    export(Recording(path), kind, out.with_suffix(f".{kind}"))
+    export(Recording(path), kind, out.with_suffix(".mcap" if kind == "ros2" else f".{kind}"))

@@ -73,7 +73,7 @@ def make_yaml(rng: Generator) -> tuple[Setup, bytes]:
         document = yaml.load(text, Loader=yaml.CSafeLoader)
         for _ in range(rng.integers(1, 4)):
             document = changed(rng, document)
-        return None, json.dumps(document).encode()
+        return None, json.dumps(document, default=str).encode()  # a time, as in a calibration
     if way < 59:
         return None, b"".join(pick(rng, WORDS) for _ in range(small_number(rng)))
     head = pick(rng, ("", f"{text}\n", f"{text}\nmotion:\n", f"{text}\nmessages:\n"))

@@ -96,7 +96,7 @@ class _Run:
         counts, status = last_status(Recording(self.recordings[-1]))
         self.good = counts.good
         self.recording = str(status["recording"]["state"])
-        self.replaced = sum("replaced" in line for line in status["events"])
+        self.replaced = sum("calibration replaced" in line for line in service.lines)
 
 
 class Attack:
@@ -151,6 +151,7 @@ class Attack:
         chance = random.Random(_SEED)
         path = self._service.socket.with_name("unit.yaml")
         good = path.read_bytes()
+        required = good.index(b"C_ba")  # cut behind it, a file is that of a unit without lever arms
         while not self._stopped.wait(0.1):
             match chance.choice(("good", "good", "half", "noise", "none")):
                 case "good":
@@ -158,7 +159,7 @@ class Attack:
                     gyro = NOMINAL.gyro.model_copy(update={"scale_arcsec_per_pulse": scale})
                     write_calibration(path, NOMINAL.model_copy(update={"gyro": gyro}))
                 case "half":
-                    path.write_bytes(good[: chance.randrange(len(good))])
+                    path.write_bytes(good[: chance.randrange(required)])
                 case "noise":
                     path.write_bytes(chance.randbytes(1000))
                 case "none":

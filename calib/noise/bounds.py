@@ -1,0 +1,53 @@
+"""Upper limits of the coefficients for any data: no other noise makes an Allan variance smaller."""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from scipy.special import chdtri
+
+from calib.noise.model import KINDS, variance_terms
+from calib.noise.pyramid import AllanVariance
+
+LEAST_INDEPENDENT: Final = 6.0
+"""Least number of independent intervals: those of averaging times up to an eighth of a single stretch."""
+
+
+CONFIDENCE: Final = 0.95
+
+
+class Bound(NamedTuple):
+    """Upper limit of a coefficient, SI, 95 %, and the averaging time that gives it."""
+
+    kind: str
+    value: float
+    tau_s: float
+
+
+def bounds(allan: AllanVariance, channel: int, interval_s: float) -> tuple[Bound, ...]:
+    """Return the upper limit of each coefficient of one channel.
+
+    Parameters
+    ----------
+    allan : AllanVariance
+        Theta in SI.
+    channel : int
+        Its number.
+    interval_s : float
+        Sample interval.
+
+    Returns
+    -------
+    tuple of Bound
+        In the order of `calib.noise.model.KINDS`.
+    """
+    allan = allan.part(allan.independent >= LEAST_INDEPENDENT)
+    tau_s = allan.tau_s(interval_s)
+    degrees = np.floor(allan.independent)
+    variance = allan.variance[:, channel] * degrees / chdtri(degrees, CONFIDENCE)
+    deviation = np.sqrt(variance) / interval_s
+    limits = deviation[:, None] / np.sqrt(variance_terms(tau_s))
+    at = np.argmin(limits, axis=0)
+    return tuple(
+        Bound(kind, float(limits[i, k]), float(tau_s[i]))
+        for k, (kind, i) in enumerate(zip(KINDS, at.tolist(), strict=True))
+    )

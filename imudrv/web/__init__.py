@@ -1,0 +1,1 @@
+"""Pages for browsers: see `imudrv.web.server`."""
