@@ -51,8 +51,12 @@ ALIASES: Final = {
 }
 """Other names of allowed licences: those of the package index, and of packages without an identifier."""
 
-STATED: Final = {"allantools": "LGPL-3.0-or-later", "eclipse-zenoh": "EPL-2.0 OR Apache-2.0"}
-"""Licences of packages whose metadata have its text, or a list without saying that one may choose."""
+STATED: Final = {
+    "allantools": "LGPL-3.0-or-later",
+    "docutils": "BSD-2-Clause",  # the GPL is that of its mode for Emacs; of allantools, for tests alone
+    "eclipse-zenoh": "EPL-2.0 OR Apache-2.0",
+}
+"""Licences of packages whose metadata have a text, or a list that leaves open what applies to what."""
 
 _CLASSIFIER: Final = "License :: OSI Approved :: "
 
