@@ -23,6 +23,7 @@ from calib.estimation.joint import estimate_joint
 from calib.estimation.priors import Priors
 from calib.estimation.result import LeverArmEstimate
 from calib.identification import CaptureSummary, IdentificationResult, PriorCalibration
+from calib.messages import english
 from calib.reports.verdict import verdict
 from calib.validation.montecarlo import (
     BUDGETS,
@@ -74,7 +75,7 @@ def outcome(seed: int, budget: Budget) -> Outcome:
         IdentificationResult(estimate, known, SITE, RotationLimits(), budget.priors, sources)
     )
     worst = next(mark for mark in marks if mark.level == overall.level)
-    return Outcome(overall.level, worst.text, estimate, truth)
+    return Outcome(overall.level, english(worst.text), estimate, truth)
 
 
 def search(seeds: Iterable[int]) -> Iterator[tuple[int, Outcome]]:
