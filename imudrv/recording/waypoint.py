@@ -47,7 +47,7 @@ _HEADER: Final = np.dtype(
 _SAMPLE: Final = np.dtype([("time", "<f8"), ("gyro", "<i4", 3), ("accelerometer", "<i4", 3)])
 _GYRO_DEG: Final = 2.0**-25  # 5.2e-10 rad; an increment may be up to 64 deg
 _ACCELEROMETER_M_S: Final = 2.0**-24  # 6.0e-8 m/s; up to 128 m/s
-_MOST_PARTS: Final = 1 << 22  # of the intervals of one message: 86 000 samples are one of 4.3 s at 20 kHz
+_MOST_PARTS: Final = 1 << 17  # of the intervals of one message: 86 000 samples are one of 4.3 s at 20 kHz
 _WEEK_NS: Final = 7 * 86_400 * NS_PER_S
 _SUNDAY_NS: Final = 4 * 86_400 * NS_PER_S  # the epoch was a Thursday, weeks begin on Sunday
 
