@@ -1,4 +1,4 @@
-"""Address of this machine itself, where servers listen unless told otherwise."""
+"""Address of this machine itself, where servers listen by default."""
 
 from typing import Final
 

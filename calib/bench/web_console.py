@@ -36,7 +36,7 @@ TOKEN: Final = re.compile(r"[A-Za-z0-9_-]{22}")
 """Form of a token of so many bytes."""
 
 _PREFIX: Final = "page_"
-"""Of the keys of labels."""
+"""Beginning of the keys of labels."""
 
 
 class WebConsole:

@@ -19,19 +19,19 @@ RATE_S: Final = 0.02
 """Length of the means of the rates, s: shorter ones would show the pulses of the gyros."""
 
 BIAS_SIGMA: Final = 0.01
-"""Of the bias of an accelerometer, m/s^2."""
+"""Prior of the bias of an accelerometer, m/s^2."""
 
 TILT_SIGMA: Final = 0.01
-"""Of gravity times a tilt, m/s^2."""
+"""Prior of gravity times a tilt, m/s^2."""
 
 ARM_SIGMA: Final = 0.3
-"""Of a component of rho, m."""
+"""Prior of a component of rho, m."""
 
 CONSTANT_SIGMA: Final = 10.0
-"""Of the constant, m/s."""
+"""Prior of the constant, m/s."""
 
 READING_SIGMA: Final = 1e-4
-"""Of a velocity that is fitted, m/s: the random walk of some seconds."""
+"""Standard deviation of a velocity that is fitted, m/s: the random walk of some seconds."""
 
 
 class RigidMotion(NamedTuple):

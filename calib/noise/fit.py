@@ -32,7 +32,7 @@ OCTAVE: Final = 2.0
 SIGMAS: Final = 2.0
 """A coefficient is observable if its square is this many times its standard uncertainty."""
 QUANTILE_95: Final = 1.645
-"""Of the normal distribution, one-sided."""
+"""Quantile of the normal distribution, one-sided."""
 
 _RIDGE: Final = 1e-9
 """Added to the correlation matrix of the estimates, against rounding."""

@@ -474,7 +474,7 @@ def _result(
     solver = _Solver(system, Z, p, site_gravity, gravity_sigma, wander)
     whole = Z @ solver.covariance @ Z.T
     fitted = solver.J @ solver.covariance @ solver.J.T
-    # below a hundredth of redundancy a residual tells nothing
+    # below a hundredth of redundancy a residual has no information
     variance = np.maximum(np.diag(solver.V) - np.diag(fitted), 0.01 * np.diag(solver.V))
     factor = cho_factor(solver.V, lower=True)
     chi_square = float(system.residual @ cho_solve(factor, system.residual))

@@ -26,7 +26,7 @@ RIGHT: Final = 0.3
 BETTER: Final = 0.5
 """An exchange explains the motions if it leaves less than this part of the difference."""
 LEAST_TURN: Final = 0.3
-"""Least change of direction of gravity, in g, by which a motion tells axes apart."""
+"""Least change of direction of gravity, in g, by which a motion distinguishes axes."""
 SIGN_SIGMAS: Final = 4.0
 
 

@@ -333,7 +333,7 @@ class Service:
     def _process(self, arrival: Arrival) -> None:
         read_ns = arrival.t_ns
         if not self._in_real_time:
-            arrival = arrival._replace(t_ns=0)  # when it came tells nothing about its samples
+            arrival = arrival._replace(t_ns=0)  # when it came has nothing to do with its samples
         self._recordings.arrived(arrival)
         self._chain.clock.follow(arrival.timebase)
         output = self._chain.feed(arrival.data, arrival.t_ns)

@@ -136,7 +136,7 @@ class Sink(ABC):
     def poll(self) -> None:
         """Accept clients, send what is queued, reopen devices.
 
-        Called eight times a second, and fifty times while `state` tells of samples in the queue.
+        Called eight times a second, and fifty times while `state` has samples in the queue.
         """
         return
 

@@ -48,7 +48,7 @@ def hostile(folder: Path, minutes: float) -> list[Check]:
             bool(np.all(attack.received["flags"][5:] & Flag.SIZE_EFFECT)),
         ),
         Check(
-            "the last status counts all samples, and tells what happened to the recordings",
+            "the last status counts all samples, and says what happened to the recordings",
             f"{attack.good:,} good; {attack.recording}",
             attack.good == attack.samples and "while it was written" in attack.recording,
         ),
