@@ -24,6 +24,7 @@ class Turn(Rotation):
 
     Attributes
     ----------
+    before, after : Rest
     reasons : tuple of Message
         Why it is outside the limits; empty: it is accepted.
     """

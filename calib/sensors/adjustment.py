@@ -68,7 +68,8 @@ class Free:
 
     Attributes
     ----------
-    pivot : {'free', 'fixed'}
+    fixed_pivot : bool
+        The unit turns about one point: the arms to it are free, and not their differences alone.
     temperature : bool
         Slopes per kelvin.
     quadratic, skew : bool
@@ -99,7 +100,7 @@ class Free:
         one = np.eye(COLUMNS)
         arms = np.zeros((COLUMNS, 9 if self.fixed_pivot else 6))
         arms[R] = np.eye(9) if self.fixed_pivot else CENTROID_BASIS
-        others = [k for k in range(COLUMNS) if k not in fixed and not 27 <= k < 36]
+        others = [k for k in range(COLUMNS) if k not in fixed and k not in range(COLUMNS)[R]]
         return np.concatenate([one[:, others], arms], axis=1)
 
 

@@ -117,6 +117,8 @@ class Left:
 
     Attributes
     ----------
+    session : int
+        Number of the capture, from 0.
     start_s, stop_s : float
         Time from the beginning of the capture.
     what : str

@@ -89,7 +89,8 @@ def receive(
     fd : int
         Socket.
     frame : ndarray of uint8, shape (FRAME_BYTES,)
-        With `timespec`, two numbers, room for the system's answers.
+    timespec : ndarray of int64, shape (2,)
+        Room for the system's answers.
     offset_ns : int
         Time of arrival less CLOCK_BOOTTIME.
     messages : ndarray of MESSAGE

@@ -62,8 +62,12 @@ class Samples:
         Nominal interval of a sample.
     unit : str
         Serial number of the unit; empty if not known.
+    origin : mapping of str to str
+        Metadata record `imu50` of a recording; empty for other files.
     calibration : Calibration or None
         That of the increments, if it is known.
+    counts : Counts
+        Of what has been yielded.
     """
 
     path: Path
