@@ -131,7 +131,7 @@ Celsius = Annotated[float, Key(ge=-100, le=200)]
 Arm = Annotated[float, Key(ge=-1000, le=1000)]
 Axes = Annotated[Matrix3, AfterValidator(_axes)]
 SerialNumber = Annotated[str, Key(max_length=64), AfterValidator(_serial_number)]
-# Base64 in its one canonical form: no other text stands for the same bytes.
+# Base64 in its one canonical form: no other text means the same bytes.
 Base64Of32Bytes = Annotated[str, Key(pattern=r"^[A-Za-z0-9+/]{42}[AEIMQUYcgkosw048]=$")]
 Base64Of64Bytes = Annotated[str, Key(pattern=r"^[A-Za-z0-9+/]{85}[AQgw]==$")]
 

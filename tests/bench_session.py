@@ -49,15 +49,15 @@ def begin(
     operator: str = "",
 ) -> Session:
     """A session whose unit's files are beside it."""
-    papers = folder.parent
-    write_calibration(papers / "unit.yaml", NOMINAL.model_copy(update={"serial_number": unit}))
-    settings_file.write(papers / "site.yaml", Site(latitude_deg=28.2, longitude_deg=113.0, height_m=60.0))
-    (papers / "bench.yaml").write_text(PROCEDURE)
+    files = folder.parent
+    write_calibration(files / "unit.yaml", NOMINAL.model_copy(update={"serial_number": unit}))
+    settings_file.write(files / "site.yaml", Site(latitude_deg=28.2, longitude_deg=113.0, height_m=60.0))
+    (files / "bench.yaml").write_text(PROCEDURE)
     return Session.create(
         folder,
-        procedure=embedded(papers / "bench.yaml"),
-        calibration=papers / "unit.yaml",
-        site=embedded(papers / "site.yaml"),
+        procedure=embedded(files / "bench.yaml"),
+        calibration=files / "unit.yaml",
+        site=embedded(files / "site.yaml"),
         profile=profile,
         port="/dev/ttyUSB0",
         bench=EmbeddedFile.of("bench.yaml", f"{{format: imu50-bench, version: 1, bench: {bench}}}".encode())

@@ -505,7 +505,7 @@ def test_a_certificate_is_read_back_bit_for_bit(
         write_calibration(Path(folder) / "cal.yaml", given_)
         read_again = read_calibration(Path(folder) / "cal.yaml")
     assert read_again == given_
-    # repr tells -0.0 from 0.0, and 1 from 1.0, and is exact for floats.
+    # repr distinguishes -0.0 from 0.0, and 1 from 1.0, and is exact for floats.
     assert repr(read_again) == repr(given_)
 
 

@@ -322,7 +322,7 @@ def test_deep_nesting_is_refused_not_recursed(file: Path, opening: str) -> None:
 
 
 def test_the_documented_depth_of_nesting_is_accepted(file: Path) -> None:
-    levels = yaml_text.MAX_DEPTH - 2  # two mappings stand around the lists
+    levels = yaml_text.MAX_DEPTH - 2  # two mappings are around the lists
     file.write_text(f"content: {{a: {'[' * levels}{']' * levels}}}")
     assert read(file, Free)
     assert "levels" in faults_in(file, f"content: {{a: {'[' * (levels + 1)}{']' * (levels + 1)}}}")

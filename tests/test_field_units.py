@@ -90,7 +90,7 @@ UNITS: Final = {
     "kvh1775": Unit(
         1000, Sensor(), Sensor(), 36, flags=AT_UNKNOWN, status=WIDE, temperatures=(("temperature", 1.0),)
     ),
-    # Nothing in the bytes tells that sample 100 is missing; a damaged message and junk might have been one.
+    # Nothing in the bytes shows that sample 100 is missing; a damaged message and junk might have been one.
     "hg4930": Unit(
         100,
         Sensor(1.164153e-10),
@@ -182,7 +182,7 @@ UNITS: Final = {
         32,
         status=WIDE,
     ),
-    # Of CAN logs the times are known, and tell how many samples are missing.
+    # The times of CAN logs are known, and show how many samples are missing.
     "openimu-j1939": Unit(
         100,
         rate(OPENIMU, zero=32000),
@@ -489,7 +489,7 @@ def test_times_of_arrival_settle_the_gaps_that_the_bytes_leave_open(name: str, s
     read = frames = 0
     now_s = 5.0
     while frames < len(whole):
-        # A reader that wakes about once a sample, at most every 4 ms, and stands still at times.
+        # A reader that wakes about once a sample, at most every 4 ms, and stalls at times.
         now_s += max(1 / unit.hz, 0.004) * random.uniform(0.5, 1.5)
         now_s += random.uniform(0.03, 0.13) * (random.random() < 0.02)
         now_s = min(now_s, 5.0 + 400 / unit.hz)

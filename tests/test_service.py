@@ -478,7 +478,7 @@ def test_a_calibration_is_replaced_while_running_and_a_bad_one_is_refused(folder
         assert service.stop() == 0
     increments = np.concatenate(list(Recording(folder / "run.mcap").increments()))
     assert increments["counter"].tolist() == list(range(400))
-    # The pulses have a period of 314 samples, so sums over the two halves tell the scales apart.
+    # The pulses have a period of 314 samples, so sums over the two halves distinguish the scales.
     again = [c for _, c in Recording(folder / "run.mcap").calibrations()]
     assert [c.gyro.scale_arcsec_per_pulse[0] for c in again] == [0.5, 1.0]
     angle = pulses(np.arange(400))

@@ -50,7 +50,7 @@ def action_of(name: str, view: View) -> Action:
 
 
 class Keyboard:
-    """Keys of the terminal, and the actions they stand for; Ctrl-C keeps its usual effect.
+    """Keys of the terminal, and their actions; Ctrl-C keeps its usual effect.
 
     There are none if standard input is no terminal.
 

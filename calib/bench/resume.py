@@ -41,7 +41,7 @@ def require_same(
     session : Session
         The session.
     procedure, calibration, site, profile
-        Files given now; None stands for the session's own.
+        Files given now; None: the session's own.
 
     Raises
     ------

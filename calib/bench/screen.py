@@ -364,7 +364,7 @@ def _banner(view: View, width: int, height: int, ascii_only: bool) -> Renderable
 
 
 def _wrapped(texts: Sequence[str], width: int, fewest: int, most: int) -> list[str]:
-    """Wrap texts into rows, each text on a new row; an ellipsis stands for rows beyond the limit."""
+    """Wrap texts into rows, each text on a new row; an ellipsis replaces rows beyond the limit."""
     rows = [row.plain for one in texts for row in Text(one).wrap(_WRAPS, width)]
     if len(rows) > most:
         rows = rows[:most]

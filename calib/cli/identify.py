@@ -13,6 +13,7 @@ from calib.cli.arguments import (
     known_point,
     written_text,
 )
+from calib.cli.result import add_result_files, write_result
 from calib.estimation.priors import Priors
 from calib.estimation.result import Extra
 from calib.identification import EstimationOptions, identify, prior_calibration
@@ -20,15 +21,14 @@ from calib.lever_arms.gauge import Gauge, LeverArms, convert
 from calib.reports.identification import report_html, terminal_document
 from calib.reports.text import print_document
 from calib.reports.truth import comparison
-from calib.result_file import result_document, write_json
+from calib.result_file import result_document
 from calib.signing.keys import bench_key
 from imudrv.calibration import read_calibration
 from imudrv.cli.arguments import add_profile
 from imudrv.errors import InputError
-from imudrv.files.atomic import atomic_write
 from imudrv.files.inputs import total_size
 from imudrv.imu.rate_filter import NAMES
-from imudrv.terminal import progress, say
+from imudrv.terminal import progress
 from imudrv.units import PPM, UG, URAD
 
 MAX_SIGMA: Final = 1e5
@@ -75,8 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add("--prior-sigma", type=_sigma, nargs=3, metavar=("UG", "PPM", "URAD"), help=text)
     add_certificate_output(parser)
-    add("--json", type=Path, metavar="R.json", help="the whole result as JSON")
-    add("--report", type=Path, metavar="R.html", help="report with figures, one file")
+    add_result_files(parser)
     add("-v", "--verbose", action="store_true", help="print the whole report, not only the result")
     text = "true unit of a simulation: the result is compared with it at the end, and does not depend on it"
     add("--truth", type=Path, metavar="T.yaml", help=text)
@@ -112,20 +111,18 @@ def run(arguments: argparse.Namespace) -> None:
         )
     arms = _in_gauge(result.arms, arguments.gauge, point)
     gauges = (arms, convert(arms, "x" if arms.gauge == "centroid" else "centroid"))
-    written = []
-    try:  # files first: the reader of the text may go away
-        if arguments.json is not None:
-            write_json(arguments.json, result_document(result, arms))
-            written.append(f"{arguments.json}: the result")
-        if arguments.report is not None:
-            with atomic_write(arguments.report) as file:
-                file.write(report_html(result, gauges).encode())
-            written.append(f"{arguments.report}: the report")
+
+    def write_certificate() -> str:
         write(arguments.output, certificate(result, arms), key)
-        written.append(written_text(arguments.output, prior.calibration, arms))
-    finally:
-        print_document(terminal_document(result, gauges, arguments.verbose))
-        say("\n".join(written))
+        return written_text(arguments.output, prior.calibration, arms)
+
+    write_result(
+        arguments,
+        terminal_document(result, gauges, arguments.verbose),
+        lambda: result_document(result, arms),
+        lambda: report_html(result, gauges),
+        write_certificate,
+    )
     if arguments.truth is not None:
         true = lever_arms_of(read_calibration(arguments.truth), str(arguments.truth))
         print_document(comparison(arms, true, arguments.truth.name))

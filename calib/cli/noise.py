@@ -7,17 +7,15 @@ from typing import Final
 
 from calib.certificate import check_target, write
 from calib.cli.arguments import add_channel, check_output
+from calib.cli.result import add_result_files, write_result
 from calib.identification import prior_calibration
 from calib.noise.analysis import analyse_noise
 from calib.noise.documents import certificate, result_document
 from calib.reports.noise import document, report_html
-from calib.reports.text import print_document
-from calib.result_file import write_json
 from calib.signing.keys import bench_key
 from imudrv.cli.arguments import add_profile
-from imudrv.files.atomic import atomic_write
 from imudrv.files.inputs import total_size
-from imudrv.terminal import OK, progress, say
+from imudrv.terminal import OK, progress
 
 EXAMPLE: Final = "rest.raw --profile imu50-rs422 --calibration unit.yaml --report noise.html -o new.yaml"
 
@@ -37,8 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = "begin of what is used, from the beginning of the capture"
     add("--from", dest="begin_s", type=float, metavar="S", help=text)
     add("--to", dest="end_s", type=float, metavar="S", help="its end")
-    add("--json", type=Path, metavar="N.json", help="the whole result as JSON")
-    add("--report", type=Path, metavar="N.html", help="report with figures, one file")
+    add_result_files(parser, "N")
     text = "certificate to write: that of the unit with its noise"
     add("-o", "--output", type=Path, metavar="NEW.yaml", help=text)
 
@@ -67,22 +64,21 @@ def run(arguments: argparse.Namespace) -> int:
             channel=arguments.channel,
             advance=advance,
         )
-    written = []
-    try:  # files first: the reader of the text may go away
-        if arguments.json is not None:
-            write_json(arguments.json, result_document(result))
-            written.append(f"{arguments.json}: the result")
-        if arguments.report is not None:
-            with atomic_write(arguments.report) as file:
-                file.write(report_html(result).encode())
-            written.append(f"{arguments.report}: the report")
-        if output is not None and result.is_bad:
-            written.append(f"{output}: not written, as the verdict is bad")
-        elif output is not None:
-            new = certificate(result)
-            write(output, new, key)
-            written.append(f"{output}: certificate of unit {new.serial_number} with its noise")
-    finally:
-        print_document(document(result))
-        say("\n".join(written))
+
+    def write_certificate() -> str | None:
+        if output is None:
+            return None
+        if result.is_bad:
+            return f"{output}: not written, as the verdict is bad"
+        new = certificate(result)
+        write(output, new, key)
+        return f"{output}: certificate of unit {new.serial_number} with its noise"
+
+    write_result(
+        arguments,
+        document(result),
+        lambda: result_document(result),
+        lambda: report_html(result),
+        write_certificate,
+    )
     return NOT_AT_REST if result.is_bad else OK

@@ -6,10 +6,9 @@ from typing import Final, get_args
 
 from calib.certificate import check_unit_file, write
 from calib.cli.arguments import add_certificate_output, add_channel, check_output
+from calib.cli.result import add_result_files, write_result
 from calib.procedure.plan import load as load_procedure
 from calib.reports.sensors import document, report_html
-from calib.reports.text import print_document
-from calib.result_file import write_json
 from calib.sensors.calibrate import SensorsOptions, calibrate_sensors
 from calib.sensors.certificate import certificate, result_document, why_none
 from calib.sensors.parameters import Nonlinearity
@@ -17,9 +16,8 @@ from calib.signing.keys import bench_key
 from imudrv.calibration import read_calibration
 from imudrv.cli.arguments import add_profile
 from imudrv.errors import InputError
-from imudrv.files.atomic import atomic_write
 from imudrv.files.inputs import total_size
-from imudrv.terminal import OK, progress, say
+from imudrv.terminal import OK, progress
 
 EXAMPLE: Final = "session.raw --profile imu50-rs422 --site site.yaml --unit 50-0017 -o unit.yaml"
 
@@ -51,8 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--without", type=_without, default=(), metavar="WHAT", help=text)
     text = "what a change of scale with the input is taken for (default: quadratic)"
     add("--nonlinearity", choices=get_args(Nonlinearity), default="quadratic", help=text)
-    add("--json", type=Path, metavar="R.json", help="the whole result as JSON")
-    add("--report", type=Path, metavar="R.html", help="report with figures, one file")
+    add_result_files(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -80,23 +77,20 @@ def run(arguments: argparse.Namespace) -> int:
             channel=arguments.channel,
             advance=advance,
         )
-    written = []
-    try:  # files first: the reader of the text may go away
-        if arguments.json is not None:
-            write_json(arguments.json, result_document(result))
-            written.append(f"{arguments.json}: the result")
-        if arguments.report is not None:
-            with atomic_write(arguments.report) as file:
-                file.write(report_html(result).encode())
-            written.append(f"{arguments.report}: the report")
+
+    def write_certificate() -> str:
         if refusal := why_none(result):
-            written.append(f"{arguments.output}: no certificate: {refusal}")
-        else:
-            write(arguments.output, certificate(result), key)
-            written.append(f"{arguments.output}: certificate of unit {arguments.unit}")
-    finally:
-        print_document(document(result))
-        say("\n".join(written))
+            return f"{arguments.output}: no certificate: {refusal}"
+        write(arguments.output, certificate(result), key)
+        return f"{arguments.output}: certificate of unit {arguments.unit}"
+
+    write_result(
+        arguments,
+        document(result),
+        lambda: result_document(result),
+        lambda: report_html(result),
+        write_certificate,
+    )
     return BAD if result.mark == "bad" else OK
 
 

@@ -61,7 +61,7 @@ def find_exchange(evidence: Evidence, p: Parameters) -> Exchange:
     Returns
     -------
     Exchange
-        No text where the axes are right, or the motions tell nothing.
+        No text where the axes are right, or the motions do not show it.
     """
     forces = [p.M @ (e - p.q * curved(e, p)) / p.gravity for e in (r.rate[3:] - p.b for r in evidence.rests)]
     carried: dict[float, list[tuple[Array, Array, Array]]] = {}

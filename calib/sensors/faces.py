@@ -21,7 +21,7 @@ from imudrv.units import ARCSEC
 SQUARENESS: Final = 3 * ARCSEC
 """Prior of the squareness of a face, 1 sigma."""
 SETTING: Final = 1 * ARCSEC
-"""Least uncertainty of how the unit stands on its face, 1 sigma; the residuals show more."""
+"""Least uncertainty of the attitude of the unit on its face, 1 sigma; the residuals show more."""
 PLATE: Final = 0.1
 """Prior of the tilt of the plate, rad."""
 

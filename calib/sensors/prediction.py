@@ -39,7 +39,7 @@ WOBBLE: Final = 1.5 * DEG
 _WOBBLE_HZ: Final = 1.3
 """How a hand sways in a motion, about each axis: it shows the sensing points and the skew."""
 _SET_DOWN: Final = Rotation.from_rotvec([2e-3, -3e-3, 0.05]).as_matrix()
-"""How the unit stands in its poses: exactly level, hardly a pulse would come in a second."""
+"""Tilt of the unit in its poses: exactly level, hardly a pulse would come in a second."""
 _RATE_HZ: Final = 100.0
 _ROOM_DEGC: Final = 25.0
 

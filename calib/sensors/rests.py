@@ -142,7 +142,7 @@ def _rate_filter(rests: Sequence[RestBins], noise: Noise, quantum: float, layout
         return STEADY
     try:
         return rate_filter("dither", layout.interval_ns)
-    except InputError:  # it is aliased into the motion; the residuals tell
+    except InputError:  # it is aliased into the motion; the residuals show it
         return STEADY
 
 

@@ -52,7 +52,7 @@ def print_losses(capture: Capture, output: Path) -> int:
 
 
 def _unknown_gaps(count: int, layout: Layout) -> str:
-    """Say how long the gaps may be whose length neither a counter nor a time of arrival tells."""
+    """Say how long the gaps may be whose length neither a counter nor a time of arrival gives."""
     gaps = "1 gap of unknown length" if count == 1 else f"{count} gaps of unknown length"
     if layout.sequence.kind is SequenceKind.NONE:
         return f"{gaps}: the unit sends no counter, and the capture has no times of arrival"

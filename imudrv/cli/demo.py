@@ -26,8 +26,8 @@ aligned and rotated by 180 deg. The inner lever arms are identified from the rec
 certificate; one more rotation, navigated with and without compensation, verifies them."""
 
 FULL_STORY: Final = """\
-A simulated unit that was never calibrated, from its raw pulses to a certificate that is proved. It stands on
-each of its six faces, is turned and carried by hand: that shows its sensors. An hour at rest shows its noise.
+A simulated unit that was never calibrated, from its raw pulses to a certificate that is proved. It is placed
+on each of its six faces, turned and carried by hand: that shows its sensors. An hour at rest shows its noise.
 Three rotations sharpen the lever arms, and one of them is navigated with and without compensation."""
 
 PROFILE: Final = "imu50-rs422"

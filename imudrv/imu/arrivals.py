@@ -1,4 +1,4 @@
-"""Missing samples from the times of arrival, where the unit's own numbers do not tell.
+"""Missing samples from the times of arrival, where the unit's own numbers do not give them.
 
 A sample can arrive late, never early. Of samples that one read delivered the last one is the freshest. How
 late it is, against the least of the last arrivals, is jitter as long as it varies, and missing samples when
@@ -13,7 +13,7 @@ import numpy as np
 from imudrv.kernels import kernel
 
 KEPT: Final = 32
-"""Arrivals that tell the jitter; while there are fewer, one sample interval counts as jitter."""
+"""Arrivals that determine the jitter; while there are fewer, one sample interval counts as jitter."""
 
 ARRIVALS: Final = np.dtype(
     [

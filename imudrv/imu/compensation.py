@@ -40,7 +40,7 @@ MAX_TAPS: Final = 32
 LEAVES_OUT_SKEW: Final = (
     "skew not compensated: a negative one needs a rate filter with a lag, centred or dither"
 )
-"""What to tell the user of `Compensator.leaves_out_skew`."""
+"""Message to the user about `Compensator.leaves_out_skew`."""
 
 CONSTANTS: Final = np.dtype(
     [

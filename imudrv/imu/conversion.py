@@ -42,7 +42,7 @@ CONSTANTS: Final = np.dtype(
         ("parts", np.int64),
         ("sequence", np.int64),  # SequenceKind
         ("bits", np.int64),
-        ("narrow", np.bool_),  # the sequence alone does not tell the length of a gap
+        ("narrow", np.bool_),  # the sequence alone does not determine the length of a gap
         ("step", np.int64),  # of `step_parts` to a count, from a sample to the next
         ("step_parts", np.int64),
         ("span", np.float64),  # samples until the sequence begins anew
@@ -128,7 +128,7 @@ def _fill_sensor(c: np.void, sensor: Sensor) -> None:
 
 
 def _limits(axis: Field) -> tuple[int, int]:
-    """Return the values at which an axis is saturated; a floating-point number tells nothing."""
+    """Return the values at which an axis is saturated; none for a floating-point number."""
     if axis.is_float:
         return _LOWEST, _HIGHEST
     if axis.signed:

@@ -54,7 +54,7 @@ class SampleCounts:
     recovered: int
     """Lost samples whose pulses are in the next running total; they are counted as lost as well."""
     unknown_gaps: int
-    """Gaps with their smallest length: no time of arrival tells how often the counter went round."""
+    """Gaps with their smallest length: no time of arrival shows how often the counter wrapped."""
 
     @property
     def closes(self) -> bool:

@@ -47,7 +47,7 @@ LOWEST_PDU2: Final = 0xF000
 
 
 class Selector(Model):
-    """A number that tells whether a field is in a message: then it, modulo `modulo`, `equals` a value."""
+    """A number that decides whether a field is in a message: then it, modulo `modulo`, `equals` a value."""
 
     type: NumberType
     offset: Offset
@@ -108,7 +108,7 @@ class Number(Model):
         if self.only_while is not None and self.name not in ("temperature", "status"):
             raise ValueError(
                 "expected 'only_while' with temperature and status only; a sensor's numbers that take turns "
-                "are messages of their own, told apart by their constants"
+                "are messages of their own, distinguished by their constants"
             )
         if self.degc_per_count == 0.0:
             raise ValueError("expected a degc_per_count other than 0, got 0")

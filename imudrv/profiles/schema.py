@@ -155,7 +155,7 @@ class Profile(Model):
                 )
 
     def _header_faults(self) -> Iterator[str]:
-        """Yield the messages that cannot be told from one before."""
+        """Yield the messages that cannot be distinguished from one before."""
         for k, message in enumerate(self.messages):
             for j, other in enumerate(self.messages[:k]):
                 one, two = message.header, other.header

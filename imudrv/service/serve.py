@@ -73,7 +73,7 @@ _GRACE_NS: Final = 5_000_000
 SERVE: Final = np.dtype(
     [
         ("until_ns", np.int64),  # when to return for housekeeping, on the scale of the arrivals
-        ("in_real_time", np.bool_),  # times of arrival tell when samples were made
+        ("in_real_time", np.bool_),  # times of arrival show when samples were made
         ("offset_ns", np.int64),  # time of arrival less CLOCK_BOOTTIME
         ("real_offset_ns", np.int64),  # CLOCK_REALTIME less time of arrival, as it is known
         ("awake_offset_ns", np.int64),  # time of arrival less CLOCK_MONOTONIC, as it is known
@@ -133,7 +133,7 @@ class Served(NamedTuple):
     why : Why
         Why it has returned.
     error : int
-        Error of the port, see `imudrv.ports.base.Port.fault`; 0: none, or the port will tell it again.
+        Error of the port, see `imudrv.ports.base.Port.fault`; 0: none, or the port will report it again.
     output : Output
         Samples, all reads together.
     data : bytes or ndarray of MESSAGE
@@ -176,7 +176,7 @@ class DescriptorLoop:
     latency : Latency
         Receives the latencies.
     in_real_time : bool
-        Whether times of arrival tell when samples were made.
+        Whether times of arrival show when samples were made.
 
     Attributes
     ----------

@@ -192,7 +192,7 @@ class Recorder:
         return self._path if self._spool.is_finished and not self.displaced else None
 
     def close(self) -> None:
-        """Write what waits and the end of the file, for some seconds at the most, and let go."""
+        """Write what waits and the end of the file, for some seconds at most, and close the file."""
         self.poll()
         self._spool.close()
 

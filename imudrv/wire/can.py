@@ -34,7 +34,7 @@ CONSTANTS: Final = np.dtype(
         ("is_ordered", np.bool_),  # the messages of a sample belong together by their order
         ("longest_ns", np.int64),  # from the first message of a sample to its last one
         ("inverted", np.uint32),  # status before any was received: no bit applies
-        ("is_plain", np.bool_),  # the identifier alone tells the kind, and a plain check is all there is
+        ("is_plain", np.bool_),  # the identifier alone gives the kind, and a plain check is all there is
     ],
     align=True,
 )

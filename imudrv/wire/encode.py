@@ -103,7 +103,7 @@ class _Encoder:
     def _write_multiplexed(
         self, rows: NDArray[np.uint8], message: Message, samples: Records, counts: list[Floats], at: Ints
     ) -> None:
-        """Write the numbers that are in some messages only, and those that tell in which."""
+        """Write the numbers that are in some messages only, and those that decide in which."""
         for (selector, modulo), group in groupby(message.multiplexed, lambda one: (one.selector, one.modulo)):
             some = list(group)
             if any(_overlap(selector, field) for field in message.fields):

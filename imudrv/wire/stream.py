@@ -1,7 +1,7 @@
 """A byte stream to frames: finds messages, checks them, and returns every other byte with a reason.
 
 Most units send one kind of message, which is a frame. Where a sample comes in several messages, these follow
-each other in the profile's order with nothing between them: that alone tells that they belong together.
+each other in the profile's order with nothing between them: only that shows that they belong together.
 """
 
 from typing import Final, NamedTuple, TypeAlias

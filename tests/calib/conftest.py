@@ -91,7 +91,7 @@ def step() -> type[Step]:
 
 @pytest.fixture(scope="session")
 def site() -> Site:
-    """Where the bench stands."""
+    """Site of the bench."""
     return SITE
 
 

@@ -43,7 +43,7 @@ WHEN = datetime(2026, 11, 25, 12, 0, tzinfo=UTC)
 
 
 def identification(**changes: object) -> IdentificationResult:
-    told = RunResult(
+    of_run = RunResult(
         label="z",
         turns=(TurnResult("z", True, np.array([0.2, -0.1, 0.0]), np.zeros((3, 9)), np.zeros(3)),),
         H_rest=1e-4,
@@ -69,7 +69,7 @@ def identification(**changes: object) -> IdentificationResult:
         parameters=(ParameterEstimate("accelerometer_bias_x", 1e-4, 2e-4, 5e-4),),
         correlation=np.full((9, 1), 0.1),
         leave_one_out=(),
-        runs=(told,),
+        runs=(of_run,),
         notes=(),
     )
     return IdentificationResult(

@@ -74,7 +74,7 @@ def test_a_narrow_counter_wraps_before_and_within_the_recording(
     (tmp_path / "narrow.yaml").write_text(text)
     begin = rounds * (1 << 16) + 65_000
     path = recorded(tmp_path / "run.mcap", range(begin, begin + 150_000), str(tmp_path / "narrow.yaml"))
-    # The recording goes on for more than a round after the attempt: nobody was there to end it.
+    # The recording continues for more than a counter period after the attempt: nobody was there to end it.
     first, last = begin + 500, begin + 70_000
     assert uncovered(Attempt(STEP, path, first, last, last - first + 1)) == ""
     assert uncovered(Attempt(STEP, path, begin - 50, last)) == (

@@ -147,7 +147,7 @@ def test_a_step_goes_through_its_phases_by_the_sensors_alone(drive: Drive, turne
     assert accepted.peak_deg_per_s == pytest.approx(180.0 * 1.875 / 2.5, rel=0.01)
     assert accepted.rest_before_s >= 30.0
     assert accepted.rest_after_s >= 3.0
-    assert abs(accepted.heading_deg) < 2.0  # 2 mrad of tilt, and a heading told in 30 s
+    assert abs(accepted.heading_deg) < 2.0  # 2 mrad of tilt, and a heading from 30 s
     (checked,) = driver.of(Checked)
     assert checked.earth_rate_deg_per_h == pytest.approx(EARTH_RATE / DEG * 3600.0, abs=0.1)
     assert driver.of(Finished)[0].accepted == ("z",)
@@ -413,7 +413,7 @@ def test_a_session_that_is_resumed_asks_no_accepted_step_again_and_counts_attemp
 ) -> None:
     (accepted,) = drive().feed(turned).of(Accepted)
     back = turned.copy()
-    back["dtheta_b"][:, :2] *= -1.0  # stands the other way round, X west
+    back["dtheta_b"][:, :2] *= -1.0  # turned by 180 deg, X west
     back["dv_b"][:, :2] *= -1.0
 
     driver = drive(Z, Z_BACK, accepted={"z": Accepted(**asdict(accepted))}, attempts={"z": 1, "z-back": 3})
@@ -850,7 +850,7 @@ def test_a_step_of_three_turns_is_one_run(drive: Drive, turns: Turns) -> None:
     (log,) = driver.engine.runs
     np.testing.assert_array_equal(np.diff(log.counter), 1)
     assert log.counter[-1] == accepted.last_counter
-    # one alignment: the log begins before the first turn and goes on through all
+    # one alignment: the log begins before the first turn and continues through all
     assert log.counter[0] < driver.of(Turned)[0].counter - 1000
     # the turns back add to what the turns there do to H: three times as much as one
     first = log.H[log.counter == driver.of(Turned)[0].counter][0, :2]
@@ -902,9 +902,9 @@ def test_a_bump_in_a_rest_repeats_the_rest_and_counts_as_no_turn(drive: Drive, t
 
     assert [round(e.angle_deg) for e in driver.of(Turned)] == [180, -180, 180]
     assert driver.of(Accepted)[0].turns_within_limits == 3
-    told = {reason for view in driver.views for reason in reasons(view)}
-    assert any(reason.startswith("rest interrupted after 2.0 s of 3: the unit moved") for reason in told)
-    assert "moved 1.0 deg before the rotation: the rest is disturbed" in told
+    shown = {reason for view in driver.views for reason in reasons(view)}
+    assert any(reason.startswith("rest interrupted after 2.0 s of 3: the unit moved") for reason in shown)
+    assert "moved 1.0 deg before the rotation: the rest is disturbed" in shown
     rests = [e.counter for e in driver.of(Entered) if e.phase is Phase.REST]
     # the second rest begins after the bump and lasts whole, before the turn back is asked for
     back = next(e for e in driver.of(Entered) if e.phase is Phase.ROTATE and e.counter > rests[1])
@@ -927,8 +927,8 @@ def test_a_rest_cut_short_by_the_next_turn_is_reported_and_the_run_continues(
     assert [round(e.angle_deg) for e in driver.of(Turned)] == [180, -180, 180]
     (accepted,) = driver.of(Accepted)
     assert (accepted.turns, accepted.turns_within_limits) == (3, 3)
-    told = {reason for view in driver.views for reason in reasons(view)}
-    assert any(reason.startswith("rest interrupted after 2.0 s of 3: the unit moved") for reason in told)
+    shown = {reason for view in driver.views for reason in reasons(view)}
+    assert any(reason.startswith("rest interrupted after 2.0 s of 3: the unit moved") for reason in shown)
 
 
 def at(samples: Records, seconds: float) -> int:

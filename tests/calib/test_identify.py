@@ -162,7 +162,7 @@ def test_without_one_of_three_rotations_there_is_no_result_without_one_of_six_ne
         assert left.shift_m is not None
         assert left.sigma_m is not None
         assert left.test is not None
-        # its rests still tell of the biases, and the noise is pooled over other rests
+        # its rests still determine the biases, and the noise is pooled over other rests
         np.testing.assert_allclose(left.shift_m, without.R_b - six.R_b, atol=0.3 * left.sigma_m.max())
         assert 0.0 < np.abs(left.shift_m).max() < 0.1 * MM
         assert np.abs(left.shift_m / left.sigma_m).max() < 4.0
@@ -334,10 +334,10 @@ def test_the_directions_that_a_plan_does_not_determine_are_named() -> None:
     # with Y never up, how z_X and x_Z lie to the others turns no level velocity out of its direction
     with pytest.raises(InputError) as caught:
         predict((THREE[0], THREE[1]), LATITUDE, SensorNoise(6e-7, 5e-5, 0))
-    told = str(caught.value)
-    assert "x_Z" in told
-    assert "z_X" in told
-    assert "Y" not in told.split("unobservable")[1].split("add")[0]  # what lies along Y is observable
+    message = str(caught.value)
+    assert "x_Z" in message
+    assert "z_X" in message
+    assert "Y" not in message.split("unobservable")[1].split("add")[0]  # what lies along Y is observable
 
 
 # --- a known pivot, and more unknowns ---

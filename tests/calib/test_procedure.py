@@ -51,14 +51,14 @@ def test_six_rotations_turn_each_pose_both_ways_and_lift_the_unit_twice() -> Non
 
 
 def test_a_prediction_is_shown_before_anyone_lifts_anything(site: Site) -> None:
-    told = {name: predicted(load(name), site) for name in shipped() if load(name).kind == "arms"}
-    rms = {name: np.sqrt(np.trace(told[name].covariance) / 9.0) / MM for name in told}
+    predictions = {name: predicted(load(name), site) for name in shipped() if load(name).kind == "arms"}
+    rms = {name: np.sqrt(np.trace(predictions[name].covariance) / 9.0) / MM for name in predictions}
 
     # mathematics, section 4: 0.045 mm rms at most with three rotations; twice as many gain a root of 2, and
     # determine the skew
     assert 0.01 < rms["three-rotations"] < 0.045
     assert rms["six-rotations"] < rms["three-rotations"] / 2**0.5
-    assert told["six-rotations"].differences_sigma.shape == (2, 3)
+    assert predictions["six-rotations"].differences_sigma.shape == (2, 3)
 
 
 def test_a_plan_that_does_not_see_the_six_differences_is_refused_with_the_direction(site: Site) -> None:

@@ -535,14 +535,14 @@ def test_the_service_gets_the_certificate_without_size_effect(session: Session) 
 
 
 def test_a_session_resumes_with_the_files_it_began_with(session: Session) -> None:
-    papers = session.folder.parent
+    files = session.folder.parent
     check_files(session)
     require_same(session)
     require_same(
         session,
-        procedure=embedded(papers / "bench.yaml"),
-        calibration=papers / "unit.yaml",
-        site=embedded(papers / "site.yaml"),
+        procedure=embedded(files / "bench.yaml"),
+        calibration=files / "unit.yaml",
+        site=embedded(files / "site.yaml"),
         profile="imu50-rs422",
     )
 

@@ -109,7 +109,7 @@ def perform(procedure: Procedure, mistakes: Sequence[Mistake] = (), seed: int = 
 
 
 def short(name: str = "three-rotations") -> Procedure:
-    """With alignments of 60 s: heading is then told to 0.3 deg, which the joint estimate bears with ease."""
+    """With alignments of 60 s: heading is then known to 0.3 deg, enough for the joint estimate."""
     return load(name).model_copy(update={"align_s": 60.0})
 
 
@@ -120,8 +120,8 @@ def assert_identified(performance: Performance) -> None:
     promised = predicted(performance.procedure, performance.scenario.site).differences_sigma.ravel()
 
     assert np.all(np.abs(error) < 3.0 * sigma), error / sigma
-    # hands turn a little slower than the plan, the noise is that of the run; a skew acts along where the unit
-    # stands from the axis, which no plan knows, so that the sum is compared and not each difference
+    # hands turn a little slower than the plan, the noise is that of the run; a skew acts along the distance
+    # of the unit from the axis, which no plan knows, so that the sum is compared and not each difference
     assert np.linalg.norm(sigma) < 1.25 * np.linalg.norm(promised), sigma / promised
     assert np.sqrt((error**2).mean()) < 0.08 * MM
 
@@ -251,11 +251,11 @@ CARELESS = {
 def test_a_mistake_in_one_of_several_turns_is_named_and_the_run_is_used(name: str) -> None:
     done = perform(some_turns(6), CARELESS[name])
 
-    told = {mistake.kind: [] for mistake in CARELESS[name]}
+    kinds = {mistake.kind for mistake in CARELESS[name]}
     assert not done.of(Rejected)
     assert [(e.turns, e.step_id) for e in done.of(Accepted)] == [(6, "z-up"), (6, "x-up"), (6, "y-up")]
     outside = [(e.step_id, e.turn, english(e.reasons[0])) for e in done.of(Turned) if e.reasons]
-    if "slow" in told:
+    if "slow" in kinds:
         assert outside == [
             ("z-up", 2, "wrong direction: +40 deg, expected -180"),
             ("x-up", 3, "peak 42 deg/s: slower than 120, expect 4.2 mm"),

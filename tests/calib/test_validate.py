@@ -50,7 +50,7 @@ def who() -> SimulatedUnit:
 
 
 def short(name: str, after_s: float = 10.0) -> Scenario:
-    """The trial with a shorter alignment, and a rest of so long at its end."""
+    """The trial with a shorter alignment, and a rest of a given length at its end."""
     made = scenario(name, ALIGN_S)
     *motion, _ = made.motion
     return made.model_copy(update={"motion": (*motion, Segment(rest=Rest(duration_s=after_s)))})
@@ -216,7 +216,7 @@ def test_noise_of_velocity_grows_as_random_walks_do_and_swings_with_schuler() ->
     for _ in range(n):  # tilt accelerates, velocity over the Earth's radius tilts back
         v = v + 9.8 * phi * dt + 5e-5 * dt**0.5 * rng.standard_normal(v.size)
         phi = phi - W2 / 9.8 * v * dt + 6e-7 * dt**0.5 * rng.standard_normal(v.size)
-    # 20 000 draws tell a sigma to 0.5 %; steps of 10 s make W dt = 1 % more
+    # 20 000 draws give a sigma to 0.5 %; steps of 10 s make W dt = 1 % more
     assert noise_velocity(np.array([3600.0]), noise, 9.8)[0] == pytest.approx(v.std(), rel=0.025)
 
 

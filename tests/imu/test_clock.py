@@ -1,4 +1,4 @@
-"""The clock model against units whose true clock is known, heard through bad timers and busy hosts."""
+"""The clock model against units whose true clock is known, received through bad timers and busy hosts."""
 
 from itertools import pairwise
 
@@ -38,7 +38,7 @@ def truth(pulses: Records, skew_ppm: float) -> Times:
     return BEGIN + elapsed + np.rint(elapsed * skew_ppm * 1e-6).astype(np.int64)
 
 
-def heard(true: Times, rng: np.random.Generator, jitter_ns: float = 100e3) -> Records:
+def received(true: Times, rng: np.random.Generator, jitter_ns: float = 100e3) -> Records:
     """Samples that arrive each on its own, late by an exponential delay."""
     pulses = samples(len(true))
     late = rng.exponential(jitter_ns, len(true)).astype(np.int64)
@@ -56,7 +56,7 @@ def through_a_latency_timer(true: Times, rng: np.random.Generator) -> Times:
 
 
 def past_stalls(arrival: Times, rng: np.random.Generator, each_s: float = 4.0) -> Times:
-    """Hold up what comes while the host stands still for 30 to 130 ms."""
+    """Hold up what comes while the host stalls for 30 to 130 ms."""
     held = arrival.copy()
     at = int(arrival[0])
     while at < arrival[-1]:
@@ -109,7 +109,7 @@ def test_pure_jitter_leaves_a_microsecond() -> None:
     rng = np.random.default_rng(1)
     true = truth(samples(120_000), 30.0)
     clock = ClockModel(TAU)
-    stamps, locked = stamped(clock, heard(true, rng))
+    stamps, locked = stamped(clock, received(true, rng))
     assert locked[LOCK:].all()
     # The least of 250 delays of 100 us is 0.4 us.
     assert np.abs(stamps - true)[LOCK:].max() < 2_000
@@ -187,7 +187,7 @@ def test_a_better_fit_is_approached_slowly() -> None:
     pulses = samples(40_000)
     true = truth(pulses, 0.0)
     arrival = true + 2 * MS
-    arrival[25_000:] -= 2 * MS  # a host that has become quick; nothing tells that apart from a better line
+    arrival[25_000:] -= 2 * MS  # a host that has become quick; nothing distinguishes that from a better line
     pulses["arrival_ns"] = arrival
     stamps, locked = stamped(ClockModel(TAU), pulses)
     assert locked[LOCK:].all()
@@ -225,7 +225,7 @@ def test_a_host_clock_that_steps_forward_is_followed_after_ten_seconds() -> None
     pulses["arrival_ns"] = truth(pulses, 0.0)
     pulses["arrival_ns"][30_000:] += S
     stamps, locked = stamped(ClockModel(TAU), pulses)
-    # Nothing tells it from a stall before all of 40 bins were late.
+    # Nothing distinguishes it from a stall before all of 40 bins were late.
     assert locked[LOCK:40_000].all()
     assert not locked[40_250:50_000].any()
     np.testing.assert_array_equal(stamps[40_250:], pulses["arrival_ns"][40_250:])
@@ -246,7 +246,7 @@ def test_stamps_are_right_within_ten_seconds_after_ntp_has_slewed_the_host(
     begin, end = 60_000, 60_000 + 1000 * seconds
     true = truth(samples(end + 40_000), 20.0)
     true += np.rint(slew * TAU * np.clip(np.arange(len(true)) - begin, 0, end - begin)).astype(np.int64)
-    stamps, locked = stamped(ClockModel(TAU), heard(true, np.random.default_rng(9)))
+    stamps, locked = stamped(ClockModel(TAU), received(true, np.random.default_rng(9)))
     assert np.abs(stamps - true)[LOCK:].max() < worst_ms * MS
     assert np.abs(stamps - true)[end + LOCK :].max() < 0.25 * MS  # 20 ppm of 10 s without a line
     assert locked[end + 2 * LOCK :].all()
@@ -430,7 +430,7 @@ def test_ten_hours_need_no_more_memory_than_a_minute_and_stay_locked() -> None:
 
 
 def on_the_arrivals_scale(count: int, seed: int) -> Records:
-    return heard(truth(samples(count), 20.0), np.random.default_rng(seed))
+    return received(truth(samples(count), 20.0), np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize("offset_ns", [3600 * S, -3600 * S, 12 * MS])
@@ -497,7 +497,7 @@ COEFFICIENTS = Coefficients(
 def test_delayed_increments_get_the_stamps_of_their_samples(cuts: list[int]) -> None:
     layout = load("imu50-rs422").layout()
     true = truth(samples(11_000), 20.0)
-    pulses = heard(true, np.random.default_rng(3))
+    pulses = received(true, np.random.default_rng(3))
     pulses = np.delete(pulses, [5_000, 5_001, 7_000])
     pulses["flags"][5_000] = Flag.MISSING_BEFORE
     stamps, locked = stamped(ClockModel(TAU), pulses)
@@ -516,7 +516,7 @@ def test_delayed_increments_get_the_stamps_of_their_samples(cuts: list[int]) -> 
 
 
 def test_samples_that_never_came_out_are_passed_over() -> None:
-    pulses = heard(truth(samples(100), 0.0), np.random.default_rng(4))
+    pulses = received(truth(samples(100), 0.0), np.random.default_rng(4))
     clock = ClockModel(TAU)
     stamps, _ = stamped(clock, pulses)
     increments = np.zeros(2, INCREMENTS)
@@ -538,7 +538,7 @@ def test_the_flag_of_a_step_moves_to_the_next_sample_that_comes_out() -> None:
 
 def test_an_increment_that_no_sample_belongs_to_is_refused() -> None:
     clock = ClockModel(TAU)
-    clock.feed(heard(truth(samples(10), 0.0), np.random.default_rng(4)))
+    clock.feed(received(truth(samples(10), 0.0), np.random.default_rng(4)))
     increments = np.zeros(1, INCREMENTS)
     increments["t_ns"] = 11 * TAU
     with pytest.raises(ValueError, match="increments of the samples fed"):

@@ -45,7 +45,7 @@ CALIBRATION = Coefficients(
         accelerometer_scale=np.array([200.0, -300.0, 100.0]) * PPM,
     ),
 )
-# No more than scale: the formulas of the size effect stand alone.
+# No more than scale: the formulas of the size effect are alone.
 IDEAL = Coefficients(
     gyro_scale=np.full(3, 1e-12),
     gyro_bias=np.zeros(3),

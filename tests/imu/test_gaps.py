@@ -86,7 +86,7 @@ def test_each_silence_of_a_unit_with_a_counter_of_8_bits_is_found_with_its_lengt
         numbers = with_silence(silence)
         samples, counts = tracked(unit, frames(numbers, timing(numbers, MS), unit))
         assert (silence, counts.missing, counts.good) == (silence, silence, len(numbers))
-        # Behind a pause of the reader, up to 32 reads do not tell whether a whole round is missing as well.
+        # After a pause of the reader, up to 32 reads do not show whether a whole round is missing as well.
         if timing is stalled:
             assert 1 <= len(flagged(samples, Flag.MISSING_BEFORE)) <= 2
         else:

@@ -193,7 +193,7 @@ def test_a_flight_along_a_great_circle_and_back_closes(north_m: float, east_m: f
         axes_en(latitude, longitude)
     )
     C_nb = Rotation.from_matrix(rotation((1.0, 2.0, 3.0), 0.7))
-    # the body keeps its attitude to n, which turns 2e-4 rad/s at the most: force and rate are all but
+    # the body keeps its attitude to n, which turns at most 2e-4 rad/s: force and rate are all but
     # constant
     dtheta = ((C_in[:-1] * C_nb).inv() * (C_in[1:] * C_nb)).as_rotvec()
     x, w = np.polynomial.legendre.leggauss(2)

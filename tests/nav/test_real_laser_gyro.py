@@ -39,7 +39,7 @@ WINDOW = (600, 960)
 """The quiet window, s."""
 QUARTERS = tuple(pairwise(range(600, 961, 90)))
 GYRO_BIAS, ACCELEROMETER_BIAS = 0.01 * DEG_PER_H, 50.0 * UG
-"""1 sigma, the class of such a unit; its calibration is not told."""
+"""1 sigma, the class of such a unit; its calibration is not published."""
 RESOLUTION = 4.9e-3  # m/s, see above
 EARTH_RADIUS = 6.36e6
 
@@ -131,7 +131,7 @@ def test_heading_is_that_of_the_vehicle_within_its_predicted_sigma(log: Log) -> 
     aligned = log.aligned(*WINDOW)
     off_deg = aligned.heading_rad / DEG - log.heading_deg
     assert abs(off_deg) < 3.0 * aligned.heading_sigma_rad / DEG
-    # 0.01 deg/h / (15.04 deg/h cos 34.2 deg) = 0.046 deg, and noise. The log tells yaw to 0.1 deg: a sigma
+    # 0.01 deg/h / (15.04 deg/h cos 34.2 deg) = 0.046 deg, and noise. The log gives yaw to 0.1 deg: a sigma
     # above it would prove nothing.
     assert 0.046 * DEG < aligned.heading_sigma_rad < 0.1 * DEG
 

@@ -60,7 +60,7 @@ def test_an_increment_is_the_integral_of_S(T: float) -> None:
     t = 0.05 + 0.05 * x
     rates = size_effect_rate(omega(t), amplitude * w * np.cos(w * t[:, None] + phase), C_BA)
     expected = 0.05 * np.einsum("j,jab->ab", weight, rates)
-    # The mean rate stands for that in the middle: w^2 T^2 / 24 of it, four sixths of its square, for 0.1 s.
+    # The mean rate is taken for that in the middle: w^2 T^2 / 24 of it, four sixths of its square, for 0.1 s.
     np.testing.assert_allclose(S.sum(axis=0), expected, atol=2.0 * (w * T) ** 2 / 24.0 * 0.1)
     assert np.abs(expected).max() > 0.5
 

@@ -112,7 +112,7 @@ def test_a_bus_that_filters_nothing_gives_both_kinds_of_identifier(arrivals):
 
 
 class Broken(can.BusABC):
-    """A bus that goes wrong as told."""
+    """A bus with given faults."""
 
     def __init__(self, trouble, state=can.BusState.ACTIVE):
         self.trouble = trouble
@@ -187,7 +187,7 @@ def adapter():
 
 
 def commands(far: int, wanted: bytes) -> bool:
-    """Read what the adapter is told until the wanted commands have come."""
+    """Read the commands to the adapter until the wanted commands have come."""
     got = bytearray()
     while wanted not in got and select.select([far], [], [], DEADLINE_S)[0]:
         got += os.read(far, 100)
@@ -267,7 +267,7 @@ def test_messages_of_another_process_arrive_in_order_and_a_foreign_datagram_is_i
     with subprocess.Popen(command, stdin=subprocess.PIPE, text=True) as sender:
         found, asked = [], 0
         deadline = time.monotonic() + DEADLINE_S
-        while asked < 2000:  # a hundred on the way at the most: UDP may lose what a buffer cannot hold
+        while asked < 2000:  # at most a hundred on the way: UDP may lose what a buffer cannot hold
             print(asked, asked + 100, file=sender.stdin, flush=True)
             asked += 100
             while sum(map(len, found)) < asked and time.monotonic() < deadline:

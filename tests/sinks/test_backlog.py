@@ -20,7 +20,7 @@ def numbers(stream: bytes) -> list[int]:
 
 
 class Consumer:
-    """Takes as many bytes a write as it is told."""
+    """Takes a given number of bytes a write."""
 
     def __init__(self) -> None:
         self.room = 0

@@ -166,7 +166,7 @@ def test_an_absent_or_failing_bus_is_reported_and_reopened(batch, wait_for, monk
 
 
 @pytest.mark.parametrize(
-    ("url", "told"),
+    ("url", "message"),
     [
         ("can://virtual/x", r"expected the outgoing profile.*profile=imu50-can"),
         ("can://virtual/x?profile=imu50-rs422", "expected a port for the serial profile"),
@@ -174,8 +174,8 @@ def test_an_absent_or_failing_bus_is_reported_and_reopened(batch, wait_for, monk
         ("can://virtual/x?profile=tools/psins-100hz.yaml", "psins-100hz"),
     ],
 )
-def test_an_impossible_gateway_is_refused(url: str, told: str) -> None:
-    with pytest.raises(InputError, match=told):
+def test_an_impossible_gateway_is_refused(url: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
         CanSink(url, SERIAL)
 
 

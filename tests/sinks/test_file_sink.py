@@ -86,15 +86,15 @@ def test_an_existing_file_is_not_changed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("url", "told"),
+    ("url", "message"),
     [
         ("file:out.npz", "export the recording"),
         ("file:/no/such/folder/out.csv", "cannot be written: No such file"),
         ("http://somewhere", "expected udp:, tcp:, serial:, can:, zenoh:, file: at the start, got 'http'"),
     ],
 )
-def test_an_invalid_output_is_refused(url: str, told: str) -> None:
-    with pytest.raises(InputError, match=told):
+def test_an_invalid_output_is_refused(url: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
         open_sink(url, profiles.load("imu50-rs422").layout())
 
 

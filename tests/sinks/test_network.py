@@ -102,7 +102,7 @@ def test_nothing_is_lost_once_a_udp_receiver_listens(batch, monkeypatch) -> None
     state = sink.state
     assert (state.state, state.healthy) == ("nobody listens", False)
     assert state.sent + state.dropped == 100
-    assert state.sent <= 1, "of the last one nothing has been heard yet"
+    assert state.sent <= 1, "nothing has been received of the last one yet"
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
         udp.bind(("127.0.0.1", port))
         udp.settimeout(DEADLINE_S)

@@ -109,7 +109,7 @@ def test_closing_does_not_wait_for_a_stuck_line(batch, wait_for) -> None:
 
 
 @pytest.mark.parametrize(
-    ("url", "told"),
+    ("url", "message"),
     [
         ("serial://ttyUSB0", "three slashes"),
         ("serial:///dev/ttyUSB0?baudrate=fast", "baudrate: expected a whole number"),
@@ -117,6 +117,6 @@ def test_closing_does_not_wait_for_a_stuck_line(batch, wait_for) -> None:
         ("serial:///dev/ttyUSB0?parity=E", "parity: expected 'none'"),
     ],
 )
-def test_invalid_settings_are_refused(url: str, told: str) -> None:
-    with pytest.raises(InputError, match=told):
+def test_invalid_settings_are_refused(url: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
         SerialSink(url)

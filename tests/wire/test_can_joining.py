@@ -45,7 +45,7 @@ def messages(rows: Sequence[tuple[int, bytes, float]]) -> np.ndarray:
 
 
 def test_a_reader_that_pauses_between_the_messages_of_a_sample_does_not_tear_it() -> None:
-    # A virtual machine stands still for up to 130 ms; this counter takes 160 ms to begin anew.
+    # A virtual machine stalls for up to 130 ms; this counter wraps after 160 ms.
     sent = [
         bosch(0x174, 1, 0),
         bosch(0x178, 1, 0),

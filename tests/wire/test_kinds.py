@@ -60,7 +60,7 @@ def message(kind: int, first: int = 0, number: int = 0) -> bytes:
 
 
 def part(k: int, n: int) -> bytes:
-    """Message k of sample n; its number tells both."""
+    """Message k of sample n; its number gives both."""
     return message(0x51 + k, n % 256, 10 * n + k)
 
 

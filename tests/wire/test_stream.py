@@ -72,7 +72,7 @@ def test_the_worked_frame_of_the_icd_decodes():
     assert frame["damaged"] == 0
 
 
-# An end that is open goes on with the bytes behind it.
+# An open end continues with the bytes after it.
 CLOSED = [name for name, (data, _, bad) in TABLE.items() if not bad or sum(bad[-1][:2]) < len(data)]
 
 
@@ -166,7 +166,7 @@ def test_damage_loses_exactly_the_damaged_frames_in_any_chunks(reference, axis):
         Faults(stream=StreamRates(**dict.fromkeys(kinds, 0.02 / len(kinds)))), [(LENGTH, HEADER)], seed=11
     )
     data, damage = line.apply(frames, np.arange(len(frames)))
-    # The first and the last frame frame the account: what is lost outside of them no counter tells.
+    # Losses are counted between the first and the last frame: no counter shows those outside.
     assert not damage.hit[[0, -1]].any()
     assert len(np.unique(damage.kind)) == len(kinds) + 1
     copies = np.where(damage.hit, 0, np.where(damage.kind == Kind.DOUBLED, 2, 1))

@@ -35,7 +35,7 @@ from .settings import WORDS, changed
 PROFILE: Final = "imu50-rs422"
 RECORDING: Final = "run-z-up-1.mcap"
 DIGEST: Final = b"0" * 64
-"""Stands for the SHA-256 of the recording, which depends on the time."""
+"""Placeholder for the SHA-256 of the recording, which depends on the time."""
 ATTEMPT: Final = {"step_id": "z-up", "attempt": 1}
 ACCEPTED: Final = {
     "event": "accepted",

@@ -88,7 +88,7 @@ class SimulatedPty(FileLine):
                 if unread != before:
                     since = time.monotonic()
             left = 0
-            with suppress(BlockingIOError):  # at its end; the queue shows 4 KiB at the most
+            with suppress(BlockingIOError):  # at its end; the queue shows at most 4 KiB
                 while piece := os.read(slave, READ_BYTES):
                     left += len(piece)
         finally:
