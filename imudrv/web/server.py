@@ -160,7 +160,7 @@ class PageServer:
 
         app = web.Application(client_max_size=MOST_BYTES)
         app.router.add_get("/ws", self._socket)
-        app.router.add_get("/{name:[a-z.]*}", self._file)
+        app.router.add_get("/{name:[A-Za-z_.]*}", self._file)
         runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
         await runner.setup()
         self._stop, self._loop = asyncio.Event(), asyncio.get_running_loop()
@@ -192,11 +192,7 @@ class PageServer:
             )
         kind = _TYPES.get(name.rpartition(".")[2], "text/plain")
         if name in self._documents and (content := self._documents[name]()):
-            headers = {
-                **_HEADERS,
-                "Content-Security-Policy": "default-src 'none'; img-src data:; style-src 'unsafe-inline'",
-            }
-            return web.Response(body=content, content_type=kind, charset="utf-8", headers=headers)
+            return web.Response(body=content, content_type=kind, charset="utf-8", headers=_DOCUMENT_HEADERS)
         if name not in self._files:
             return web.Response(status=404, text="no such page\n", headers=_HEADERS)
         return web.Response(body=self._files[name], content_type=kind, charset="utf-8", headers=_HEADERS)
