@@ -22,6 +22,8 @@ STANDARD_GRAVITY: Final = 9.80665
 """Standard gravity, m/s^2 (3rd CGPM, 1901)."""
 UG: Final = 1e-6 * STANDARD_GRAVITY
 """One micro-g, m/s^2."""
+MGAL: Final = 1e-5
+"""One milligal, m/s^2."""
 MM: Final = 1e-3
 """One millimetre, m."""
 URAD: Final = 1e-6

@@ -1,7 +1,6 @@
 """After the steps: result, the operator's decision, activation of the certificate, and report."""
 
 from collections.abc import Iterator
-from typing import Final
 
 from calib.bench.entries import Decision
 from calib.bench.journal import journal_dates
@@ -11,14 +10,15 @@ from calib.bench.result import Result, identify_session
 from calib.bench.screen import OperatorScreen
 from calib.bench.session import Session
 from calib.bench.simulated_unit import is_rehearsal
-from calib.bench.state import JOURNAL, REPORT, RESULT
+from calib.bench.state import JOURNAL, REPORTS, RESULT
 from calib.bench.web_console import WebConsole
 from calib.certificate import check_target, write
 from calib.lever_arms.gauge import convert
-from calib.messages import Message, english, message
+from calib.messages import Message, message, text
 from calib.procedure.events import Rejected, Skipped
 from calib.reports.certificate import Particulars
-from calib.reports.certificate import document as certificate_document
+from calib.reports.certificate import documents as certificate_documents
+from calib.reports.document import MARK_NAMES
 from calib.reports.html import as_html
 from calib.reports.identification import arms_text
 from calib.reports.verdict import verdict
@@ -26,13 +26,6 @@ from imudrv.calibration import Calibration, read_calibration
 from imudrv.errors import InputError
 from imudrv.files import atomic, settings_file
 from imudrv.files.atomic import atomic_write
-
-_MARKS: Final = {
-    "good": message("mark_good"),
-    "note": message("mark_note"),
-    "caution": message("mark_caution"),
-    "bad": message("mark_bad"),
-}
 
 
 def session_result(session: Session) -> Result:
@@ -101,8 +94,8 @@ def ask_operator(
 def summarise(result: Result, screen: OperatorScreen) -> None:
     """Print what the operator needs for the decision."""
     screen.print(arms_text(result.identification.arms))
-    for mark, text in verdict(result.identification):
-        screen.say(message("mark", mark=_MARKS[mark], text=text))
+    for mark, why in verdict(result.identification):
+        screen.say(message("mark", mark=MARK_NAMES[mark], text=why))
 
 
 def activate(session: Session, certificate: Calibration) -> None:
@@ -139,12 +132,12 @@ def accepted_result(session: Session) -> tuple[Message, ...]:
         return ()
     return (
         message("active_certificate", path=str(session.plan.certificate.path)),
-        message("report", path=str(session.folder / REPORT)),
+        message("report_written", folder=str(session.folder)),
     )
 
 
 def write_report(session: Session, result: Result, verified: Message | None = None) -> None:
-    """Write the report and record its hash.
+    """Write the report in each language and record its hash.
 
     Parameters
     ----------
@@ -157,33 +150,41 @@ def write_report(session: Session, result: Result, verified: Message | None = No
     """
     verified = message("verification_due") if verified is None else verified
     arms, identification = result.identification.arms, result.identification
-    plan, simulated = session.plan, is_rehearsal(session.folder)
-    dates = journal_dates(session.folder / JOURNAL)
+    plan, is_simulated = session.plan, is_rehearsal(session.folder)
     particulars = Particulars(
         number=f"{plan.unit}-{identification.created:%Y%m%d}-{session.files[RESULT][:8]}",
         bench=session.bench(),
         operator=plan.operator or session.bench().operator,
-        procedure=f"{session.procedure().name}, SHA-256 {plan.procedure.sha256[:16]}, {plan.software}",
-        measured=" to ".join(dict.fromkeys(dates)),
+        received=plan.received,
+        procedure=message(
+            "procedure_edition",
+            name=session.procedure().name,
+            edition=plan.procedure.sha256[:16],
+            software=plan.software,
+        ),
+        measured=journal_dates(session.folder / JOURNAL),
         attempts=tuple(_deviations(session)),
         verified=verified,
-        is_simulated=simulated,
     )
-    page = as_html(
-        certificate_document(identification, (arms, convert(arms, "x")), particulars),
-        number=particulars.number,
-        watermark="SIMULATED" if simulated else "",
-    )
-    with atomic_write(session.path(REPORT)) as file:
-        file.write(page.encode())
-    session.record_file(REPORT)
+    documents = certificate_documents(identification, (arms, convert(arms, "x")), particulars)
+    for language, document in documents.items():
+        name = REPORTS[language]
+        page = as_html(
+            document,
+            number=particulars.number,
+            watermark=text(message("certificate_simulated"), language) if is_simulated else "",
+            language=language,
+        )
+        with atomic_write(session.path(name)) as file:
+            file.write(page.encode())
+        session.record_file(name)
 
 
-def _deviations(session: Session) -> Iterator[tuple[str, str]]:
+def _deviations(session: Session) -> Iterator[tuple[Message, Message]]:
     """Return rejected attempts and skipped steps, and why."""
     for entry in session.entries:
         if isinstance(entry, Rejected):
-            why = "; ".join(map(english, entry.reasons))
-            yield f"rejected: {entry.step_id}, attempt {entry.attempt}", why
+            why = message("reasons", reasons=tuple(entry.reasons))
+            yield message("attempt_rejected", step=entry.step_id, attempt=entry.attempt), why
         elif isinstance(entry, Skipped):
-            yield f"skipped: {entry.step_id}", "by the operator"
+            yield message("step_skipped", step=entry.step_id), message("by_the_operator")

@@ -64,6 +64,8 @@ Digest = Annotated[str, Key(pattern=r"^[0-9a-f]{64}$")]
 """SHA-256, hexadecimal."""
 Line = Annotated[str, Key(max_length=4096), AfterValidator(printable)]
 """Text that is printed in messages."""
+Date = Annotated[str, Key(pattern=r"^(\d{4}-\d{2}-\d{2})?$")]
+"""Such as 2026-11-26, or empty."""
 FileName = Annotated[str, Key(max_length=255), AfterValidator(_file_name)]
 """Name of a file in the session's folder; no path."""
 AbsolutePath = Annotated[Path, AfterValidator(_absolute)]
@@ -133,6 +135,8 @@ class Plan:
         Who calibrates, where and with what; None if there is no such file, and in older journals.
     operator : str
         Who conducts the session; empty if unknown.
+    received : str
+        Date on which the unit was received; empty if unknown.
     host : str
         Name of the computer; empty in older journals.
     """
@@ -148,6 +152,7 @@ class Plan:
     profile: UndamagedFile
     bench: UndamagedFile | None = None
     operator: Line = ""
+    received: Date = ""
     host: Line = ""
 
 

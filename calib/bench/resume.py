@@ -9,7 +9,7 @@ from rich.console import Console
 
 from calib.bench.entries import EmbeddedFile, Resumed
 from calib.bench.session import Session
-from calib.bench.state import REPORT, RESULT
+from calib.bench.state import REPORTS, RESULT
 from calib.bench.verify import faulty_files
 from calib.messages import Message, message, text
 from imudrv import profiles
@@ -22,7 +22,8 @@ RESUME_KELVIN: Final = 5.0
 
 def check_files(session: Session) -> None:
     """Raise `InputError` if a file of the session is missing or damaged."""
-    if faults := faulty_files(session, session.files.keys() - {REPORT}):  # the report is written anew
+    others = session.files.keys() - set(REPORTS.values())  # a report is written anew
+    if faults := faulty_files(session, others):
         raise InputError("\n  ".join([f"{session.folder}: cannot be resumed:", *faults]))
 
 

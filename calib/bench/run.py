@@ -5,7 +5,7 @@ import time
 from collections.abc import Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, date, datetime
 from pathlib import Path
 from signal import SIGINT, SIGTERM
 from threading import Thread
@@ -23,7 +23,7 @@ from calib.bench.resume import check_files, require_same, resume, steps_message
 from calib.bench.screen import OperatorScreen
 from calib.bench.session import Session
 from calib.bench.simulated_unit import SimulatedUnitProcess, is_rehearsal
-from calib.bench.state import JOURNAL, REPORT, RESULT, WORKING_CERTIFICATE
+from calib.bench.state import JOURNAL, REPORT, REPORTS, RESULT, WORKING_CERTIFICATE
 from calib.bench.technician import BENCH, mistakes_of
 from calib.bench.web_console import WebConsole
 from calib.certificate import lever_arms_of
@@ -102,6 +102,8 @@ class RunOptions:
         Bench file of a new session; None: that of the user's configuration, if there is one.
     operator, unit : str or None
         Who conducts a new session, and the serial number on the unit; asked at a terminal if not given.
+    received : date or None
+        When the unit of a new session was received.
     redo : sequence of str
         Steps of an existing session to do again.
     plan : bool
@@ -127,6 +129,7 @@ class RunOptions:
     bench: Path | None = None
     operator: str | None = None
     unit: str | None = None
+    received: date | None = None
     redo: Sequence[str] = ()
     plan: bool = False
     language: str | None = None
@@ -282,10 +285,11 @@ def conduct(session: Session, options: RunOptions, console: Console, web: WebCon
         options.say(console, line)
     if web is not None:
         web.end(controller.outcome)
-    report = session.folder / REPORT
-    if options.pdf and REPORT in session.files:
-        write_pdf(report, report.with_suffix(".pdf"))
-        options.say(console, message("report", path=str(report.with_suffix(".pdf"))))
+    for name in REPORTS.values():
+        if options.pdf and name in session.files:
+            report = session.folder / name
+            write_pdf(report, report.with_suffix(".pdf"))
+            options.say(console, message("report", path=str(report.with_suffix(".pdf"))))
     if simulated is not None:
         result = session.folder / RESULT
         found = lever_arms_of(read_calibration(result), str(result))
@@ -364,6 +368,7 @@ def _create(options: RunOptions, console: Console) -> Session:
         port=port,
         bench=None if bench is None else EmbeddedFile.of(str(bench_path), bench.content),
         operator=operator,
+        received=options.received.isoformat() if options.received else "",
     )
 
 

@@ -89,6 +89,7 @@ class Session(SessionState):
         port: str,
         bench: EmbeddedFile | None = None,
         operator: str = "",
+        received: str = "",
     ) -> Self:
         """Create a session in a new folder.
 
@@ -108,6 +109,8 @@ class Session(SessionState):
             Who calibrates, where and with what; already checked.
         operator : str
             Who conducts the session.
+        received : str
+            Date on which the unit was received.
 
         Returns
         -------
@@ -132,6 +135,7 @@ class Session(SessionState):
             profile=EmbeddedFile.of(profile, profiles.content(profile)),
             bench=bench,
             operator=operator,
+            received=received,
             host=platform.node()[:64],
         )
         try:

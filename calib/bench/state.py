@@ -42,6 +42,10 @@ RESULT: Final = "certificate.yaml"
 REPORT: Final = "report.html"
 
 
+REPORTS: Final = {"en": REPORT, "zh_CN": "report.zh_CN.html"}
+"""The report in each language of `calib.messages`."""
+
+
 PROFILE: Final = "profile.yaml"
 
 

@@ -4,6 +4,7 @@ import json
 import os
 import re
 import secrets
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -16,7 +17,7 @@ from calib.bench.result import Result
 from calib.bench.screen import PHASES, large_text, shown_last_try, shown_reasons, tone
 from calib.bench.session import Session
 from calib.bench.simulated_unit import is_rehearsal
-from calib.bench.state import REPORT, WEB_TOKEN
+from calib.bench.state import REPORTS, WEB_TOKEN
 from calib.messages import LANGUAGES, Message, catalogue, text
 from calib.procedure.events import Action, View
 from calib.procedure.plan import verification
@@ -60,13 +61,12 @@ class WebConsole:
     def __init__(self, session: Session, address: str, language: str) -> None:
         self._actions: SimpleQueue[dict[str, Any]] = SimpleQueue()
         page = resources.files(__package__).joinpath("page")
-        report = session.folder / REPORT
         self._server = PageServer(
             {file.name: file for file in page.iterdir() if file.is_file()},
             address,
             _token(session.folder / WEB_TOKEN),
             self._actions.put,
-            {REPORT: lambda: report.read_bytes() if REPORT in session.files else b""},
+            {name: partial(_report, session, name) for name in REPORTS.values()},
         )
         self.url = self._server.url
         procedure = session.procedure()
@@ -82,6 +82,7 @@ class WebConsole:
                 "steps": steps,
                 "language": language,
                 "labels": {name: _labels(name) for name in LANGUAGES},
+                "reports": REPORTS,
                 "questions": {name: _texts(question) for name, question in QUESTIONS.items()},
             },
         )
@@ -146,6 +147,11 @@ class WebConsole:
 
     def _keep(self, kind: str, content: dict[str, Any]) -> None:
         self._server.keep(kind, json.dumps({"kind": kind, **content}))
+
+
+def _report(session: Session, name: str) -> bytes:
+    """Return the content of a report; empty until it is written."""
+    return (session.folder / name).read_bytes() if name in session.files else b""
 
 
 def _labels(language: str) -> dict[str, str]:

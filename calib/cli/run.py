@@ -1,6 +1,7 @@
 """Command `calib run`."""
 
 import argparse
+from datetime import date
 from pathlib import Path
 from typing import Final
 
@@ -33,6 +34,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="SERIAL",
         help="serial number on the unit; another one than the certificate's is refused",
     )
+    text = "when the unit was received, such as 2026-11-26, for the certificate"
+    add("--received", type=date.fromisoformat, metavar="DATE", help=text)
     add("--procedure", metavar="P", help=f"{', '.join(plan.shipped())}, or a procedure file")
     text = "folder for journal and recordings; an existing session is resumed"
     add("--session", dest="folder", type=Path, default=new_folder(), metavar="DIR", help=text)

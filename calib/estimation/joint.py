@@ -11,7 +11,7 @@ space without such a shift, which is the gauge `centroid`.
 """
 
 from collections.abc import Sequence
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
@@ -93,20 +93,11 @@ def estimate_joint(
             "rotations between rests determine six, as a common shift of the three sensing points causes no "
             "velocity at rest; choose another gauge, or turn the unit about a fixed point and use pivot fixed"
         )
-    noise = noise_of(runs)
-    parameters = prior_parameters(runs, priors, terms)
-    basis = np.eye(9) if pivot == "fixed" else CENTROID_BASIS
-    designs, system = _equations(runs, noise, pivot, parameters)
-    sigma, directions = system.directions()
-    rank = int((sigma < priors.arm).sum())
-    if rank < basis.shape[1]:
-        require_axes(runs)
-        raise InputError(unobservable_text(sigma, directions, basis, priors.arm))
-    x, _ = system.solve(basis)
-    known = [design.known(x[system.columns_of(k)]) for k, design in enumerate(designs)]
-    designs, system = _equations(runs, noise, pivot, parameters, known)
+    solution = solve(runs, priors, pivot=pivot, terms=terms)
+    designs, system, noise, basis, x, covariance = solution
+    parameters = system.parameters
     sigma, _ = system.directions()
-    x, covariance = system.solve(basis)
+    rank = int((sigma < priors.arm).sum())
     R = x[:9]
     scatter, redundancy = scatter_and_redundancy(
         system, x, covariance, basis, noise, in_motion=pivot == "fixed"
@@ -149,6 +140,52 @@ def estimate_joint(
             if n.name.startswith("quadratic") and not n.observable
         ),
     )
+
+
+class Solution(NamedTuple):
+    """Solution of the equations of all runs."""
+
+    designs: list[Design]  # of each run
+    system: NormalEquations
+    noise: SensorNoise
+    basis: Array  # (9, d), of R
+    x: Array
+    covariance: Array
+
+
+def solve(
+    runs: Sequence[Run], priors: Priors, *, pivot: Literal["free", "fixed"] = "free", terms: Sequence[str]
+) -> Solution:
+    """Return the estimate of all unknowns, to second order; see `estimate_joint`.
+
+    Parameters
+    ----------
+    runs, priors, pivot
+        As for `estimate_joint`.
+    terms : sequence of {'skew', 'quadratic'}
+        Parameters beyond biases and matrices.
+
+    Returns
+    -------
+    Solution
+
+    Raises
+    ------
+    InputError
+        The rotations do not determine the directions of R.
+    """
+    noise = noise_of(runs)
+    parameters = prior_parameters(runs, priors, terms)
+    basis = np.eye(9) if pivot == "fixed" else CENTROID_BASIS
+    designs, system = _equations(runs, noise, pivot, parameters)
+    sigma, directions = system.directions()
+    if int((sigma < priors.arm).sum()) < basis.shape[1]:
+        require_axes(runs)
+        raise InputError(unobservable_text(sigma, directions, basis, priors.arm))
+    x, _ = system.solve(basis)
+    known = [design.known(x[system.columns_of(k)]) for k, design in enumerate(designs)]
+    designs, system = _equations(runs, noise, pivot, parameters, known)
+    return Solution(designs, system, noise, basis, *system.solve(basis))
 
 
 def _equations(

@@ -24,6 +24,7 @@ from scipy.linalg import block_diag, solve_triangular
 from calib.estimation.design import Design, back_action, interpolated
 from calib.estimation.noise import SensorNoise
 from calib.estimation.priors import SHARED, Priors
+from calib.estimation.readings import Readings
 from calib.estimation.result import Extra
 from calib.estimation.runs import Run
 from imudrv.arrays import Array
@@ -92,6 +93,7 @@ class RunEquations(NamedTuple):
     A: Array
     v: Array  # (n,)
     accepted: tuple[bool, ...]  # of each turn
+    readings: Readings  # of the equations
 
     def whitened(self, y: Array) -> Array:
         """Return whitened values of the first equations; those of the others are zero."""
@@ -136,21 +138,45 @@ def prior_parameters(runs: Sequence[Run], priors: Priors, terms: Sequence[str]) 
 def run_equations(run: Run, noise: SensorNoise, pivot: str, design: Design) -> RunEquations:
     """Return the equations of the readings; with a known pivot also of the motion and the vertical."""
     readings = run.readings
-    t, d, variance = readings.t_s, readings.direction_n, readings.variance
-    columns = design.at(t, readings.arrest)
-    v = readings.v + np.einsum("ni,ni->n", d, interpolated(run.t_s, back_action(run), t))
-    A = np.einsum("ni,nij->nj", d, columns)
+    columns = design.at(readings.t_s, readings.arrest)
+    added = interpolated(run.t_s, back_action(run), readings.t_s)
+    readings = readings._replace(v=readings.v + np.einsum("ni,ni->n", readings.direction_n, added))
+    A = np.einsum("ni,nij->nj", readings.direction_n, columns)
     if pivot == "fixed":
-        more = _motion(run, design)
-        t, d, v, A = (np.concatenate(pair) for pair in zip((t, d, v, A), more, strict=True))
-        coarse = float(np.trace(readings.turn)) + LEAST_MOTION**2
-        variance = np.concatenate([variance, np.full(len(t) - len(variance), coarse)])
-    passed = np.concatenate([readings.arrest, np.zeros(len(t) - len(readings.arrest), np.int64)])
-    pulses = d @ readings.start @ d.T + np.minimum.outer(passed, passed) * (d @ readings.turn @ d.T)
-    K = walk_covariance(t, d, noise, run.gravity) + pulses + np.diag(variance)
+        readings, of_motion = _with_motion(readings, run, design)
+        A = np.concatenate([A, of_motion])
+    K = sum(noise_sources(readings, noise, run.gravity).values())
     L = np.asarray(np.linalg.cholesky(K), np.float64)
-    white = solve_triangular(L, np.column_stack([A, v]), lower=True)
-    return RunEquations(L, white[:, :-1], white[:, -1], tuple(turn.accepted for turn in run.turns))
+    white = solve_triangular(L, np.column_stack([A, readings.v]), lower=True)
+    accepted = tuple(turn.accepted for turn in run.turns)
+    return RunEquations(L, white[:, :-1], white[:, -1], accepted, readings)
+
+
+def noise_sources(readings: Readings, noise: SensorNoise, gravity: float) -> dict[str, Array]:
+    """Return the covariance of the readings by source; the sum is that of their noise."""
+    t, d, passed = readings.t_s, readings.direction_n, readings.arrest
+    velocity_walk, angle_walk = walk_covariances(t, d, noise, gravity)
+    pulses = d @ readings.start @ d.T + np.minimum.outer(passed, passed) * (d @ readings.turn @ d.T)
+    return {
+        "velocity_walk": velocity_walk,
+        "angle_walk": angle_walk,
+        "pulses": pulses + np.diag(readings.variance),
+    }
+
+
+def _with_motion(readings: Readings, run: Run, design: Design) -> tuple[Readings, Array]:
+    """Return the readings with those of the motion and the vertical, and the columns of these."""
+    t, d, v, A = _motion(run, design)
+    coarse = float(np.trace(readings.turn)) + LEAST_MOTION**2
+    more = {
+        "t_s": t,
+        "arrest": np.zeros(len(t), np.int64),
+        "direction_n": d,
+        "v": v,
+        "variance": np.full(len(t), coarse),
+    }
+    joined = {key: np.concatenate([getattr(readings, key), x]) for key, x in more.items()}
+    return readings._replace(**joined), A
 
 
 def _motion(run: Run, design: Design) -> tuple[Array, Array, Array, Array]:
@@ -169,12 +195,13 @@ def _motion(run: Run, design: Design) -> tuple[Array, Array, Array, Array]:
     )
 
 
-def walk_covariance(t: Array, d: Array, noise: SensorNoise, gravity: float) -> Array:
-    """Return the covariance of the random walks at the times t along the directions d."""
+def walk_covariances(t: Array, d: Array, noise: SensorNoise, gravity: float) -> tuple[Array, Array]:
+    """Return the covariances of the random walks of velocity and of angle at times t along directions d."""
     s, u = np.minimum.outer(t, t), np.maximum.outer(t, t)
     tilt = (gravity * noise.angle_walk) ** 2 * s * s * (3.0 * u - s) / 6.0
     level = d[:, :2]
-    return np.asarray(noise.velocity_walk**2 * s * (d @ d.T) + tilt * (level @ level.T), np.float64)
+    velocity_walk = noise.velocity_walk**2 * s * (d @ d.T)
+    return np.asarray(velocity_walk, np.float64), np.asarray(tilt * (level @ level.T), np.float64)
 
 
 class NormalEquations:

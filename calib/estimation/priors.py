@@ -1,7 +1,6 @@
 """Prior uncertainty of a unit: residual errors of its static calibration."""
 
 import re
-from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -75,25 +74,6 @@ class Priors:
         ]
         return np.diag(np.concatenate(sigma) ** 2)
 
-    def knowing(self, names: Collection[str]) -> "Priors":
-        """Return the priors of a unit some of whose errors are known.
-
-        Parameters
-        ----------
-        names : collection of str
-            ``skew`` and names of the first six: then a million times smaller, to stay regular.
-
-        Returns
-        -------
-        Priors
-        """
-        factor = np.ones(len(SHARED))
-        for rows, name in zip(_GROUPS.values(), _SIX, strict=True):
-            if name in names:
-                factor[rows] = 1e-6
-        covariance = factor[:, None] * self.shared_covariance * factor
-        return replace(self, covariance=covariance, skew=0.0 if "skew" in names else self.skew)
-
 
 AGEING: Final = Priors(
     accelerometer_bias=3.0 * UG,
@@ -150,15 +130,6 @@ _GROUPS: Final = {
     "gyro.C_bg": 15 + _OFF_DIAGONAL,
 }
 """Beginning of the paths in a certificate, and the errors of `SHARED` that these numbers cause."""
-_SIX: Final = (
-    "accelerometer_bias",
-    "accelerometer_scale",
-    "accelerometer_misalignment",
-    "gyro_bias",
-    "gyro_scale",
-    "gyro_misalignment",
-)
-"""The prior of each group."""
 
 
 def _error(calibration: Calibration, name: str) -> Array:

@@ -16,7 +16,7 @@ import numpy as np
 
 from calib.bench import journal
 from calib.bench.entries import Decision
-from calib.bench.state import JOURNAL, REPORT, RESULT, SessionState
+from calib.bench.state import JOURNAL, REPORTS, RESULT, SessionState
 from calib.bench.verify import faulty_files
 from calib.certificate import lever_arms_of
 from calib.fleet.changes import Measurement
@@ -208,7 +208,8 @@ def _fault(session: SessionState) -> str:
     decision = session.stage(Decision)
     if RESULT not in session.files or decision is None or not decision.accepted:
         return "no accepted result"
-    return "; ".join(faulty_files(session, session.files.keys() - {REPORT}))  # it may be written anew
+    others = session.files.keys() - set(REPORTS.values())  # a report may be written anew
+    return "; ".join(faulty_files(session, others))
 
 
 def _differences(arms: LeverArms) -> tuple[Array, Array]:

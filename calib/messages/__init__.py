@@ -4,21 +4,17 @@ A catalogue is a YAML file with one line for each key; its text is a Python form
 the message. Text of `imudrv` (alignment, service, recordings) is the message `verbatim`.
 """
 
-import locale
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
-from importlib import resources
-from typing import Final, TypeAlias, Union
+from typing import TypeAlias, Union
 
-import yaml
+from imudrv.messages import LANGUAGES, language
+from imudrv.messages import catalogue as texts_of
+
+__all__ = ["LANGUAGES", "Message", "Value", "catalogue", "english", "language", "message", "text", "verbatim"]
 
 Value: TypeAlias = Union[str, int, float, "Message", tuple[str, ...], tuple["Message", ...]]
 """Number, name, message, or several names or messages."""
-
-LANGUAGES: Final = ("en", "zh_CN")
-"""Languages with a catalogue; the first one is the default."""
 
 
 @dataclass(frozen=True)
@@ -57,35 +53,9 @@ def text(what: Message, language: str) -> str:
     return _render(what, catalogue(language))
 
 
-def language(name: str | None = None) -> str:
-    """Return the one of `LANGUAGES` that is nearest to a language.
-
-    Parameters
-    ----------
-    name : str, optional
-        Such as ``zh_CN``, ``zh-Hans`` or ``en_GB.UTF-8``. Default: the language of the system.
-
-    Returns
-    -------
-    str
-        ``en`` for an unknown language.
-    """
-    name = (name or _system_language()).replace("-", "_").lower()
-    return next((known for known in LANGUAGES if name[:2] == known[:2]), LANGUAGES[0])
-
-
-def _system_language() -> str:
-    names = (os.environ.get(variable) for variable in ("LC_ALL", "LC_MESSAGES", "LANG"))
-    name = next(filter(None, names), None) or locale.getlocale()[0] or ""
-    return name.replace("Chinese", "zh")  # as Windows calls it
-
-
-@cache
 def catalogue(language: str) -> Mapping[str, str]:
     """Return the texts of one of `LANGUAGES` by key."""
-    content = resources.files(__name__).joinpath(f"{language}.yaml").read_bytes()
-    texts: dict[str, str] = yaml.safe_load(content)
-    return texts
+    return texts_of(language, __name__)
 
 
 def _render(what: Message, texts: Mapping[str, str]) -> str:

@@ -2,32 +2,22 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Final
 
-import numpy as np
-
-from calib.estimation.joint import estimate_joint
 from calib.identification import IdentificationResult
 from calib.lever_arms.gauge import LeverArms
-from calib.messages import Message, english
-from calib.reports.document import Block, Document, KeyValues, Paragraph, Section, Table, sanitise
-from calib.reports.format import mm
+from calib.messages import LANGUAGES, Message, message, text
+from calib.reports.budget import budget
+from calib.reports.document import Block, Document, KeyValues, Paragraph, Say, Section, Table, drawn, sanitise
 from calib.reports.identification import document as report
-from imudrv.arrays import Array
+from calib.reports.identification import result_blocks
 from imudrv.bench import Bench
 from imudrv.calibration import Calibration
 from imudrv.units import MM
 
-_SOURCES = {
-    "accelerometer bias": ("accelerometer_bias",),
-    "accelerometer scale factor": ("accelerometer_scale",),
-    "accelerometer misalignment": ("accelerometer_misalignment",),
-    "gyro bias": ("gyro_bias",),
-    "gyro scale factor and misalignment (axis of rotation)": ("gyro_scale", "gyro_misalignment"),
-    "gyro-accelerometer skew": ("skew",),
-}
-"""Priors of each source of uncertainty."""
-
-_DIFFERENCES = tuple(f"r_x - r_{other}, {axis}" for other in "yz" for axis in "XYZ")
+_LINE: Final = "_" * 30
+"""Where a person writes."""
 
 
 @dataclass(frozen=True)
@@ -42,32 +32,32 @@ class Particulars:
         Who, where and with what.
     operator : str
         Who did it.
-    procedure : str
+    received : str
+        Date on which the unit was received.
+    procedure : Message
         Name and edition.
-    measured : str
+    measured : tuple of (str, str)
         First and last date.
-    attempts : tuple of (str, str)
+    attempts : tuple of (Message, Message)
         Rejected attempts and skipped steps, and why.
     verified : Message
         Outcome of the verification.
-    is_simulated : bool
-        The unit is a simulated one.
     """
 
     number: str
     bench: Bench
     operator: str
-    procedure: str
-    measured: str
-    attempts: tuple[tuple[str, str], ...]
+    received: str
+    procedure: Message
+    measured: tuple[str, str]
+    attempts: tuple[tuple[Message, Message], ...]
     verified: Message
-    is_simulated: bool
 
 
-def document(
+def documents(
     identification: IdentificationResult, arms: Sequence[LeverArms], particulars: Particulars
-) -> Document:
-    """Return the certificate, with the report of the identification as its annex.
+) -> dict[str, Document]:
+    """Return the certificate in each language, with the report of the identification, in English, as annex.
 
     Parameters
     ----------
@@ -80,82 +70,107 @@ def document(
 
     Returns
     -------
-    Document
+    dict of str to Document
+        By the names of `LANGUAGES`.
     """
-    annex = report(identification, arms)
-    result, *others = annex.sections
+    annex = drawn(report(identification, arms)).sections[1:]
+    return {
+        language: _document(identification, arms, particulars, annex, partial(text, language=language))
+        for language in LANGUAGES
+    }
+
+
+def _document(
+    identification: IdentificationResult,
+    arms: Sequence[LeverArms],
+    particulars: Particulars,
+    annex: Sequence[Section],
+    say: Say,
+) -> Document:
     prior = identification.prior_calibration.calibration
+    result = (*result_blocks(identification, arms, say), Paragraph(say(message("coverage"))))
     return Document(
-        f"Calibration certificate {particulars.number}",
-        f"Inner lever arms of unit {sanitise(prior.serial_number)}",
+        say(message("certificate_title", number=particulars.number)),
+        say(message("certificate_subtitle", unit=sanitise(prior.serial_number))),
         (
-            Section("Laboratory, item and dates", tuple(_particulars(identification, particulars))),
-            Section("Procedure and environment", tuple(_procedure(identification, particulars))),
-            replace(result, title="Results", blocks=(*result.blocks, _COVERAGE)),
-            Section("Uncertainty budget", tuple(_budget(identification))),
-            Section("Traceability", tuple(_traceability(identification, particulars))),
-            Section("Before and after adjustment", tuple(_adjustment(prior, particulars))),
-            Section("Decision rule and deviations", tuple(_deviations(particulars))),
-            Section("Signatures", tuple(_signatures(particulars))),
-            *(replace(section, title=f"Annex: {section.title}") for section in others),
-            Section("End of the certificate", ()),
+            Section(say(message("section_item")), tuple(_item(identification, particulars, say))),
+            Section(say(message("section_procedure")), tuple(_procedure(identification, particulars, say))),
+            Section(say(message("section_results")), result),
+            Section(say(message("section_budget")), tuple(budget(identification, arms[0], say))),
+            Section(say(message("section_traceability")), tuple(_traceability(identification, say))),
+            Section(say(message("section_adjustment")), (_adjustment(prior, particulars, say),)),
+            Section(say(message("section_deviations")), tuple(_deviations(particulars, say))),
+            Section(say(message("section_signatures")), tuple(_signatures(particulars, say))),
+            *(
+                replace(section, title=say(message("section_annex", title=section.title)))
+                for section in annex
+            ),
+            Section(say(message("section_end")), ()),
         ),
     )
 
 
-_COVERAGE = Paragraph(
-    "U = k u with the coverage factor k = 2: for a normal distribution, a coverage probability of about 95 %."
-)
-
-
-def _particulars(identification: IdentificationResult, given: Particulars) -> Iterator[Block]:
+def _item(identification: IdentificationResult, given: Particulars, say: Say) -> Iterator[Block]:
     bench, prior = given.bench, identification.prior_calibration.calibration
+    first, last = given.measured
     rows = (
-        ("laboratory", bench.laboratory),
-        ("address", bench.address),
-        ("customer", bench.customer),
-        ("bench", bench.bench),
-        ("operator", given.operator),
-        ("authorised by", bench.authorised_by),
-        ("maker", bench.unit.maker),
-        ("type", bench.unit.type),
-        ("serial number", prior.serial_number),
-        ("condition", "in working order: the checks before the measurement have passed"),
-        ("received", ""),
-        ("measured", given.measured),
-        ("issued", f"{identification.created:%Y-%m-%d}"),
-        ("software", identification.software),
-    )
-    yield KeyValues(tuple((name, sanitise(value)) for name, value in rows))
-    if blank := [name for name, value in rows if not value]:
-        yield Paragraph(f"Left blank, as not stated: {', '.join(blank)}.")
-    yield Paragraph("The results relate only to this item, in the condition in which it was measured.")
-
-
-def _procedure(identification: IdentificationResult, given: Particulars) -> Iterator[Block]:
-    site, warm = identification.site, [t for source in identification.sources for t in source.temperatures]
-    gravity = "normal gravity of the site" if site.gravity_m_s2 is None else "measured, from the site file"
-    degc = "not reported by the unit"
-    if warm:
-        degc = (
-            f"{min(t.least_degc for t in warm):.1f} to {max(t.most_degc for t in warm):.1f} degC, in the unit"
-        )
-    yield KeyValues(
+        (message("item_laboratory"), bench.laboratory),
+        (message("item_address"), bench.address),
+        (message("item_customer"), bench.customer),
+        (message("item_bench"), bench.bench),
+        (message("item_operator"), given.operator),
+        (message("item_authorised_by"), bench.authorised_by),
+        (message("item_maker"), bench.unit.maker),
+        (message("item_type"), bench.unit.type),
+        (message("item_serial_number"), prior.serial_number),
+        (message("item_condition"), say(message("in_working_order"))),
+        (message("item_received"), given.received),
         (
-            ("procedure", sanitise(given.procedure)),
-            ("temperature", degc),
-            (
-                "site",
-                f"latitude {site.latitude_deg:.6f} deg, longitude {site.longitude_deg:.6f} deg, "
-                f"height {site.height_m:.1f} m",
-            ),
-            ("gravity", f"{site.gravity:.5f} m/s^2, {gravity}"),
-        )
+            message("item_measured"),
+            first if first == last else say(message("period", first=first, last=last)),
+        ),
+        (message("item_issued"), f"{identification.created:%Y-%m-%d}"),
+        (message("item_software"), identification.software),
     )
+    yield KeyValues(tuple((say(name), sanitise(value)) for name, value in rows))
+    if blank := tuple(name for name, value in rows if not value):
+        yield Paragraph(say(message("left_blank", names=blank)))
+    yield Paragraph(say(message("this_item_only")))
+
+
+def _procedure(identification: IdentificationResult, given: Particulars, say: Say) -> Iterator[Block]:
+    site, warm = identification.site, [t for source in identification.sources for t in source.temperatures]
+    degc = message("temperature_unknown")
+    if warm:
+        low, high = min(t.least_degc for t in warm), max(t.most_degc for t in warm)
+        degc = message("temperature_range", low_degc=low, high_degc=high)
+    position = message(
+        "site_position",
+        latitude_deg=site.latitude_deg,
+        longitude_deg=site.longitude_deg,
+        height_m=site.height_m,
+    )
+    gravity = message("gravity_normal", gravity_m_s2=site.gravity)
+    if site.gravity_m_s2 is not None:
+        gravity = message("gravity_measured", gravity_m_s2=site.gravity)
+    rows = (
+        (message("procedure_used"), given.procedure),
+        (message("temperature_of_unit"), degc),
+        (message("room"), message("room_not_recorded")),
+        (message("site"), position),
+        (message("local_gravity"), gravity),
+    )
+    yield KeyValues(tuple((say(name), sanitise(say(value))) for name, value in rows))
     if given.bench.instruments:
+        head = (
+            message("instrument"),
+            message("item_serial_number"),
+            message("instrument_certificate"),
+            message("instrument_valid_until"),
+        )
         yield Table(
-            "Instruments and surveys",
-            ("", "serial number", "certificate", "valid until"),
+            say(message("instruments")),
+            tuple(map(say, head)),
             tuple(
                 (sanitise(i.name), i.serial_number, i.certificate, i.valid_until or "")
                 for i in given.bench.instruments
@@ -163,86 +178,45 @@ def _procedure(identification: IdentificationResult, given: Particulars) -> Iter
         )
 
 
-def _budget(identification: IdentificationResult) -> Iterator[Block]:
-    total = identification.result.differences_sigma.ravel()
-    parts = {name: _part(identification, keys, total) for name, keys in _SOURCES.items()}
-    known = np.sqrt(np.sum([part**2 for part in parts.values()], axis=0))
-    noise = np.sqrt(np.maximum(total**2 - known**2, 0.0))
-    rows = {
-        "noise: velocity and angle random walk, pulses": noise,
-        **parts,
-        "combined, u": total,
-        "U, k = 2": 2.0 * total,
-    }
-    yield Table(
-        "Standard uncertainty of the differences by source, mm",
-        ("", *_DIFFERENCES),
-        tuple((name, *(mm(float(u), ".4f") for u in row)) for name, row in rows.items()),
-    )
-    yield Paragraph(
-        "The part of a source is what the combined uncertainty loses when the source is known exactly; the "
-        "noise, as estimated in the rests, has the remainder. A common shift of the three points is not "
-        "determined: the gauge fixes it."
-    )
+def _traceability(identification: IdentificationResult, say: Say) -> Iterator[Block]:
+    gravity = message("traceability_gravity_normal")
+    if identification.site.gravity_m_s2 is not None:
+        gravity = message("traceability_gravity_measured")
+    yield Paragraph(say(message("traceability_angle")))
+    yield Paragraph(say(gravity))
+    yield Paragraph(say(message("traceability_time")))
 
 
-def _part(identification: IdentificationResult, keys: Sequence[str], total: Array) -> Array:
-    """Return the part of some priors in the uncertainty of the differences, m."""
-    known = identification.priors.knowing(keys)
-    without = estimate_joint(identification.runs, known).differences_sigma.ravel()
-    part: Array = np.sqrt(np.maximum(total**2 - without**2, 0.0))
-    return part
-
-
-def _traceability(identification: IdentificationResult, given: Particulars) -> Iterator[Block]:
-    site = identification.site
-    origin = "the site's survey" if site.gravity_m_s2 is not None else "the normal gravity formula of WGS 84"
-    for text in (
-        "Angle: half turns, closed by the direction of gravity and the rotation of the Earth.",
-        f"Acceleration: local gravity, from {origin}.",
-        "Time: the unit's clock, compared with that of the host at every sample.",
-    ):
-        yield Paragraph(text)
-
-
-def _adjustment(prior: Calibration, given: Particulars) -> Iterator[Block]:
-    size_effect = prior.size_effect
-    before = "no lever arms: the size effect was not compensated"
+def _adjustment(prior: Calibration, given: Particulars, say: Say) -> Block:
+    before, size_effect = message("adjustment_no_arms"), prior.size_effect
     if size_effect is not None:
         arms = "; ".join(
             f"r_{i} ({', '.join(f'{v:+.3f}' for v in r)})"
             for i, r in zip("xyz", size_effect.r_m / MM, strict=True)
         )
-        before = f"{arms} mm, gauge {size_effect.gauge}"
-    yield KeyValues(
-        (
-            ("before", before),
-            ("after", "the results above, in the unit's certificate"),
-            ("verification", english(given.verified)),
-        )
+        before = message("adjustment_arms", arms=arms, gauge=size_effect.gauge)
+    rows = (
+        (message("adjustment_before"), before),
+        (message("adjustment_after"), message("adjustment_result")),
+        (message("adjustment_verification"), given.verified),
     )
+    return KeyValues(tuple((say(name), say(value)) for name, value in rows))
 
 
-def _deviations(given: Particulars) -> Iterator[Block]:
-    yield Paragraph(
-        "Decision rule: the result is accepted by a person if no verdict above is bad; the uncertainty is "
-        "stated and not subtracted from a limit (simple acceptance)."
-    )
+def _deviations(given: Particulars, say: Say) -> Iterator[Block]:
+    yield Paragraph(say(message("decision_rule")))
     if given.attempts:
-        yield KeyValues(tuple((sanitise(what), sanitise(why)) for what, why in given.attempts))
+        yield KeyValues(tuple((sanitise(say(what)), sanitise(say(why))) for what, why in given.attempts))
     else:
-        yield Paragraph("Deviations: none; no attempt was rejected and no step was skipped.")
+        yield Paragraph(say(message("no_deviations")))
 
 
-def _signatures(given: Particulars) -> Iterator[Block]:
-    line = "_" * 30
-    yield KeyValues(
-        (
-            (f"operator {sanitise(given.operator)}".strip(), f"date {line}  signature {line}"),
-            (
-                f"authorised by {sanitise(given.bench.authorised_by)}".strip(),
-                f"date {line}  signature {line}",
-            ),
-        )
+def _signatures(given: Particulars, say: Say) -> Iterator[Block]:
+    names = (
+        message("signed_operator", name=sanitise(given.operator)),
+        message("signed_authorised", name=sanitise(given.bench.authorised_by)),
     )
-    yield Paragraph("This certificate may be reproduced only in full. The annexes belong to it.")
+    line = say(message("signature_line", line=_LINE))
+    yield KeyValues(tuple((say(name).strip(), line) for name in names))
+    yield Paragraph(say(message("only_in_full")))
+    yield Paragraph(say(message("annex_language")))

@@ -1,8 +1,11 @@
 """Content of a document, without its form: `text` and `html` render it."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final, TypeAlias
+
+from calib.messages import Message, message
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,9 @@ class Figure:
     draw: Callable[[], bytes]
 
 
+Say: TypeAlias = Callable[[Message], str]
+"""Returns the text of a message in the language of a document."""
+
 Block: TypeAlias = Paragraph | KeyValues | Table | Figure
 
 
@@ -56,9 +62,32 @@ class Document:
     sections: tuple[Section, ...]
 
 
+def drawn(document: Document) -> Document:
+    """Return a document with its figures drawn, for more than one use."""
+    sections = (
+        replace(
+            section,
+            blocks=tuple(
+                replace(block, draw=partial(bytes, block.draw())) if isinstance(block, Figure) else block
+                for block in section.blocks
+            ),
+        )
+        for section in document.sections
+    )
+    return replace(document, sections=tuple(sections))
+
+
 def sanitise(text: str) -> str:
     """Return text of a file without characters that could control a terminal."""
     return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
 
 
 MARKS: Final = {"good": "bold green", "note": "bold", "caution": "bold yellow", "bad": "bold red"}
+"""Marks of a verdict, and their style on a terminal."""
+
+MARK_NAMES: Final = {
+    "good": message("mark_good"),
+    "note": message("mark_note"),
+    "caution": message("mark_caution"),
+    "bad": message("mark_bad"),
+}

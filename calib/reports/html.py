@@ -7,13 +7,14 @@ from importlib import resources
 from string import Template
 from typing import Final
 
-from calib.reports.document import MARKS, Block, Document, Figure, KeyValues, Paragraph
+from calib.messages import message, text
+from calib.reports.document import MARK_NAMES, Block, Document, Figure, KeyValues, Paragraph
 
 LONG: Final = 15
 """A table of more rows may be broken by a page's end."""
 
 
-def as_html(document: Document, number: str = "", watermark: str = "") -> str:
+def as_html(document: Document, number: str = "", watermark: str = "", language: str = "en") -> str:
     """Return a document as one HTML file, figures inside, nothing loaded from elsewhere.
 
     Parameters
@@ -24,6 +25,8 @@ def as_html(document: Document, number: str = "", watermark: str = "") -> str:
         Number on every printed page.
     watermark : str
         Word across every printed page.
+    language : str
+        Language of the document.
 
     Returns
     -------
@@ -31,11 +34,15 @@ def as_html(document: Document, number: str = "", watermark: str = "") -> str:
         The file.
     """
     body = "\n".join(
-        f"<section>\n<h2>{escape(section.title)}</h2>\n{''.join(map(_marked_up, section.blocks))}</section>"
+        f"<section>\n<h2>{escape(section.title)}</h2>\n"
+        f"{''.join(_marked_up(block, language) for block in section.blocks)}</section>"
         for section in document.sections
     )
     page = Template(resources.files(__package__).joinpath("page.html").read_text("utf-8"))
+    counters = {"page": '" counter(page) "', "pages": '" counter(pages) "'}
     return page.substitute(
+        language=language.replace("_", "-"),
+        page_of=text(message("certificate_page", page=counters["page"], pages=counters["pages"]), language),
         title=escape(document.title),
         subtitle=escape(document.subtitle),
         number=re.sub("[^A-Za-z0-9._-]", "", number),
@@ -44,7 +51,7 @@ def as_html(document: Document, number: str = "", watermark: str = "") -> str:
     )
 
 
-def _marked_up(block: Block) -> str:
+def _marked_up(block: Block, language: str) -> str:
     if isinstance(block, Paragraph):
         return f"<p>{escape(block.text)}</p>\n"
     if isinstance(block, Figure):
@@ -54,11 +61,7 @@ def _marked_up(block: Block) -> str:
             f"<figcaption>{escape(block.title)}</figcaption></figure>\n"
         )
     if isinstance(block, KeyValues):
-        rows = "".join(
-            f'<tr><th class="{name if name in MARKS else "name"}">{escape(name)}</th>'
-            f"<td>{escape(value)}</td></tr>\n"
-            for name, value in block.rows
-        )
+        rows = "".join(_pair(name, value, language) for name, value in block.rows)
         return f'<table class="pairs">\n{rows}</table>\n'
     head = "".join(f"<th>{escape(name)}</th>" for name in block.head)
     rows = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>\n" for row in block.rows)
@@ -67,3 +70,9 @@ def _marked_up(block: Block) -> str:
         f'<h3>{escape(block.title)}</h3>\n<table class="{kind}">\n<thead><tr>{head}</tr></thead>\n'
         f"<tbody>\n{rows}</tbody></table>\n"
     )
+
+
+def _pair(name: str, value: str, language: str) -> str:
+    mark = MARK_NAMES.get(name)
+    kind, shown = ("name", name) if mark is None else (name, text(mark, language))
+    return f'<tr><th class="{kind}">{escape(shown)}</th><td>{escape(value)}</td></tr>\n'

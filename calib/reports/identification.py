@@ -17,9 +17,19 @@ from calib.estimation.result import LeaveOneOut, LeverArmEstimate, ParameterEsti
 from calib.estimation.runs import Run
 from calib.identification import CaptureSummary, IdentificationResult, scatter
 from calib.lever_arms.gauge import LeverArms
-from calib.messages import english
+from calib.messages import english, message
 from calib.reports import figures
-from calib.reports.document import Block, Document, Figure, KeyValues, Paragraph, Section, Table, sanitise
+from calib.reports.document import (
+    Block,
+    Document,
+    Figure,
+    KeyValues,
+    Paragraph,
+    Say,
+    Section,
+    Table,
+    sanitise,
+)
 from calib.reports.format import counted, decimals, mm, three_digits
 from calib.reports.html import as_html
 from calib.reports.text import blocks_text
@@ -46,7 +56,7 @@ def document(identification: IdentificationResult, arms: Sequence[LeverArms]) ->
         f"Inner lever arms of unit {sanitise(identification.prior_calibration.calibration.serial_number)}",
         f"Identification of {identification.created:%Y-%m-%d %H:%M} UTC, {identification.software}",
         (
-            Section("Result", tuple(_result(identification, arms))),
+            Section("Result", tuple(result_blocks(identification, arms))),
             Section("Input data", tuple(_inputs(identification))),
             Section("Rotations", tuple(_rotations(identification))),
             Section("Rejected motions", tuple(_rejected(identification.sources))),
@@ -89,16 +99,32 @@ def arms_text(arms: LeverArms) -> str:
     return blocks_text([_arms_table(arms)])
 
 
-def _result(identification: IdentificationResult, arms: Sequence[LeverArms]) -> Iterator[Block]:
+def result_blocks(
+    identification: IdentificationResult, arms: Sequence[LeverArms], say: Say = english
+) -> Iterator[Block]:
+    """Return verdict, arms and differences of a report.
+
+    Parameters
+    ----------
+    identification, arms
+        As for `document`.
+    say : callable
+        Language of the report.
+
+    Returns
+    -------
+    iterator of Block
+    """
     result = identification.result
-    yield KeyValues(tuple((mark, english(text)) for mark, text in verdict(identification)))
-    yield Paragraph("u is the standard uncertainty (k = 1), U the expanded one (k = 2).")
-    yield from map(_arms_table, arms)
+    yield KeyValues(tuple((mark, say(text)) for mark, text in verdict(identification)))
+    yield Paragraph(say(message("u_and_U")))
+    for one in arms:
+        yield _arms_table(one, say)
     sigma = result.differences_sigma
     fixed = f".{decimals(sigma)}f"
     yield Table(
-        "Differences of the sensing points, mm, the same in every gauge",
-        ("", "value", "u", "U"),
+        say(message("differences_table")),
+        ("", say(message("value")), "u", "U"),
         tuple(
             (
                 f"r_x - r_{other}, {axis}",
@@ -112,15 +138,13 @@ def _result(identification: IdentificationResult, arms: Sequence[LeverArms]) -> 
     )
     C_ba = np.array(identification.prior_calibration.calibration.accelerometer.C_ba)
     yield Figure(
-        f"Sensing points, gauge {arms[0].gauge}, and sensing directions. Grey cross: origin of the body "
-        "frame; dot in a circle: towards the reader, cross in a circle: away",
-        lambda: figures.sensing_points(arms[0].r_b, C_ba),
+        say(message("points_figure", gauge=arms[0].gauge)), lambda: figures.sensing_points(arms[0].r_b, C_ba)
     )
 
 
-def _arms_table(arms: LeverArms) -> Table:
+def _arms_table(arms: LeverArms, say: Say = english) -> Table:
     """Return the nine components, with their uncertainties if these are known."""
-    title = f"Sensing points in body axes, mm, gauge {arms.gauge}"
+    title = say(message("arms_table", gauge=arms.gauge))
     if arms.covariance is None:
         rows = [(f"r_{i}", *(mm(v, "+.3f") for v in r)) for i, r in zip("xyz", arms.r_b, strict=True)]
         return Table(title, ("", "X", "Y", "Z"), tuple(rows))

@@ -24,13 +24,24 @@ LATENCY: Final = np.dtype(
 
 
 class LatencyReport(NamedTuple):
-    """Quantiles of the latency since the start, s, and the number of samples later than the deadline."""
+    """Latency since the start.
+
+    Attributes
+    ----------
+    p50_s, p99_s, p999_s, max_s : float
+        Quantiles, s.
+    late : int
+        Number of samples later than the deadline.
+    histogram : tuple of (int, int)
+        Largest latency of each bin that is not empty, ns, and the number of samples in it.
+    """
 
     p50_s: float
     p99_s: float
     p999_s: float
     max_s: float
     late: int
+    histogram: tuple[tuple[int, int], ...] = ()
 
 
 class Latency:
@@ -59,16 +70,19 @@ class Latency:
 
     @property
     def report(self) -> LatencyReport:
-        """Quantiles so far; zeros before the first sample."""
+        """Latency so far; zeros before the first sample."""
         s = self.state[0]
-        passed, worst_ns = np.cumsum(s["counts"]), int(s["worst_ns"])
+        counts, worst_ns = s["counts"], int(s["worst_ns"])
+        passed, used = np.cumsum(counts), np.flatnonzero(counts)
+        histogram = tuple(zip(map(_upper_ns, used.tolist()), counts[used].tolist(), strict=True))
 
         def quantile(share: float) -> float:
             if not passed[-1]:
                 return 0.0
             return min(_upper_ns(int(np.searchsorted(passed, share * passed[-1]))), worst_ns) * NS
 
-        return LatencyReport(quantile(0.5), quantile(0.99), quantile(0.999), worst_ns * NS, int(s["late"]))
+        quantiles = quantile(0.5), quantile(0.99), quantile(0.999), worst_ns * NS
+        return LatencyReport(*quantiles, int(s["late"]), histogram)
 
 
 @kernel

@@ -1,7 +1,7 @@
 """Live view of a running service on the terminal."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import chain
 from pathlib import Path
 from typing import Final, TypeAlias
@@ -14,6 +14,7 @@ from rich.text import Text
 
 from imudrv.errors import InputError
 from imudrv.imu.clock import STALL_EDGES_S
+from imudrv.messages import catalogue
 from imudrv.service.status import Status
 from imudrv.service.status_socket import ask
 
@@ -27,7 +28,7 @@ Row: TypeAlias = tuple[str, str, str]
 """Name, text and style."""
 
 
-def monitor(path: Path, console: Console) -> None:
+def monitor(path: Path, console: Console, language: str) -> None:
     """Show the status until Ctrl-C; wait for a service that has ended to start again.
 
     Parameters
@@ -36,13 +37,15 @@ def monitor(path: Path, console: Console) -> None:
         Socket of the service.
     console : Console
         Output. If it is not a terminal, the status is shown once.
+    language : str
+        One of `imudrv.messages.LANGUAGES`.
 
     Raises
     ------
     InputError
         No service runs when the monitor starts.
     """
-    shown = view(Status.from_json(ask(path)))
+    shown = view(Status.from_json(ask(path)), language)
     if not console.is_terminal:
         console.print(shown)
         return
@@ -50,18 +53,20 @@ def monitor(path: Path, console: Console) -> None:
         while True:
             time.sleep(PERIOD_S)
             try:
-                live.update(view(Status.from_json(ask(path))), refresh=True)
+                live.update(view(Status.from_json(ask(path)), language), refresh=True)
             except InputError as error:
                 live.update(Panel(Text(str(error), "red"), title="no service"), refresh=True)
 
 
-def view(status: Status) -> RenderableType:
+def view(status: Status, language: str = "en") -> RenderableType:
     """Return the screen of a status; it fits 80 columns and 24 lines.
 
     Parameters
     ----------
     status : Status
         Status of a service.
+    language : str
+        Language of the rows; reasons and events are English.
 
     Returns
     -------
@@ -72,60 +77,66 @@ def view(status: Status) -> RenderableType:
     table = Table.grid(padding=(0, 2), expand=True)
     table.add_column(style="bold", no_wrap=True)
     table.add_column(ratio=1)
-    for name, text, style in rows(status):
+    for name, text, style in rows(status, language):
         table.add_row(name, Text(text, style, overflow="ellipsis"))
     events = Text("\n".join(status.events[-3:]), "dim", overflow="ellipsis", no_wrap=True)
     return Group(health, table, events)
 
 
-def rows(status: Status) -> Iterator[Row]:
-    """Return the rows of a status."""
+def rows(status: Status, language: str) -> Iterator[Row]:
+    """Return the rows of a status in one of the languages."""
     sections = _line_rows, _time_rows, _unit_rows, _output_rows, _sample_rows
-    return chain.from_iterable(section(status) for section in sections)
+    texts = catalogue(language)
+    return chain.from_iterable(section(status, texts) for section in sections)
 
 
-def _line_rows(status: Status) -> Iterator[Row]:
+def _line_rows(status: Status, texts: Mapping[str, str]) -> Iterator[Row]:
     port, samples = status.port, status.samples
-    yield "unit", f"{status.unit}, {status.profile}, calibration {status.calibration.sha256[:12]}", ""
-    yield "port", f"{port.url}: {port.state}, {port.reconnects} reconnects", ""
-    rate = f"{status.rate_hz:.1f} of {status.nominal_rate_hz:g} samples/s, {samples.good} good"
-    yield "rate", rate, ""
-    counts = {name.replace("_", " "): getattr(samples, name) for name in _LOSSES}
-    losses = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
-    yield "losses", losses or "none", "yellow" if losses else ""
+    unit = {"unit": status.unit, "profile": status.profile, "calibration": status.calibration.sha256[:12]}
+    yield texts["unit"], texts["unit_value"].format(**unit), ""
+    opened = {"url": port.url, "state": port.state, "reconnects": port.reconnects}
+    yield texts["port"], texts["port_value"].format(**opened), ""
+    rate = {"rate_hz": status.rate_hz, "nominal_rate_hz": status.nominal_rate_hz, "good": samples.good}
+    yield texts["rate"], texts["rate_value"].format(**rate), ""
+    counts = {name: getattr(samples, name) for name in _LOSSES}
+    losses = ", ".join(f"{count} {texts[name]}" for name, count in counts.items() if count)
+    yield texts["losses"], losses or texts["none"], "yellow" if losses else ""
     if status.rejected:
         rejected = (f"{entry.runs} {name.replace('_', ' ')}" for name, entry in status.rejected.items())
-        yield "rejected", ", ".join(rejected), "yellow"
+        yield texts["rejected"], ", ".join(rejected), "yellow"
 
 
-def _time_rows(status: Status) -> Iterator[Row]:
+def _time_rows(status: Status, texts: Mapping[str, str]) -> Iterator[Row]:
     clock, latency = status.clock, status.latency
-    locked = "locked" if clock.locked else "not locked"
-    skew = "unknown" if clock.skew_ppm is None else f"{clock.skew_ppm:+.2f} ppm"
-    steps = f", stepped {clock.steps} times" if clock.steps else ""
-    yield "clock", f"{locked}, skew {skew}, worst {clock.worst_s:.3f} s{steps}", ""
+    model = {
+        "locked": texts["locked" if clock.locked else "not_locked"],
+        "skew": texts["unknown"] if clock.skew_ppm is None else f"{clock.skew_ppm:+.2f} ppm",
+        "worst_s": clock.worst_s,
+    }
+    steps = texts["clock_steps"].format(steps=clock.steps) if clock.steps else ""
+    yield texts["clock"], texts["clock_value"].format(**model) + steps, ""
     names = [f"<{edge * 1e3:g}" for edge in STALL_EDGES_S] + [f">={STALL_EDGES_S[-1] * 1e3:g}"]
     stalls = [f"{n} {name}" for name, n in zip(names, clock.stalls, strict=True) if n]
-    yield "stalls", f"{', '.join(stalls)} ms" if stalls else "none", ""
-    quantiles = zip(("p50", "p99", "p99.9", "max"), latency, strict=False)
+    yield texts["stalls"], f"{', '.join(stalls)} ms" if stalls else texts["none"], ""
+    quantiles = zip(("p50", "p99", "p99.9", "max"), latency[:4], strict=True)
     text = ", ".join(f"{name} {seconds * 1e6:.0f}" for name, seconds in quantiles)
-    yield "latency", f"{text} us; {latency.late} late", ""
+    yield texts["latency"], texts["latency_value"].format(quantiles=text, late=latency.late), ""
 
 
-def _unit_rows(status: Status) -> Iterator[Row]:
+def _unit_rows(status: Status, texts: Mapping[str, str]) -> Iterator[Row]:
     degc = (f"{name} {'?' if t is None else f'{t:.2f}'}" for name, t in status.temperature_degc.items())
-    yield "degC", ", ".join(degc) or "none sent", ""
-    yield "BIT", ", ".join(status.unit_status.bits) or "clear", "red" if status.unit_status.faults else ""
+    yield texts["temperatures"], ", ".join(degc) or texts["none_sent"], ""
+    bits = ", ".join(status.unit_status.bits)
+    yield texts["status_bits"], bits or texts["clear"], "red" if status.unit_status.faults else ""
 
 
-def _output_rows(status: Status) -> Iterator[Row]:
+def _output_rows(status: Status, texts: Mapping[str, str]) -> Iterator[Row]:
     for sink in [*status.sinks, *([status.recording] if status.recording else [])]:
-        text = f"{sink.state}, {sink.sent} sent, {sink.dropped} dropped, {sink.queued} queued"
-        yield sink.url[-24:], text, "" if sink.healthy else "red"
+        yield sink.url[-24:], texts["output_value"].format(**sink._asdict()), "" if sink.healthy else "red"
 
 
-def _sample_rows(status: Status) -> Iterator[Row]:
+def _sample_rows(status: Status, texts: Mapping[str, str]) -> Iterator[Row]:
     last = status.last
-    yield "counter", f"{last.counter}  {' '.join(last.flags)}", ""
+    yield texts["counter"], f"{last.counter}  {' '.join(last.flags)}", ""
     yield "dtheta_b", "  ".join(f"{x:+.3e}" for x in last.dtheta_b) + " rad", ""
     yield "dv_b", "  ".join(f"{x:+.3e}" for x in last.dv_b) + " m/s", ""

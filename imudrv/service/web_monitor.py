@@ -3,7 +3,7 @@
 import json
 import secrets
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from importlib import resources
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from imudrv.errors import InputError
+from imudrv.messages import LANGUAGES, catalogue
 from imudrv.service.monitor import rows
 from imudrv.service.status import Status
 from imudrv.service.status_socket import ask
@@ -25,7 +26,11 @@ PERIOD_S: Final = 0.25
 """Interval of the frames, s."""
 
 
-def serve(path: Path, address: str, say: Callable[[str], None]) -> None:
+_PREFIX: Final = "page_"
+"""Beginning of the keys of labels."""
+
+
+def serve(path: Path, address: str, say: Callable[[str], None], language: str) -> None:
     """Serve the page until Ctrl-C; wait for a service that has ended to start again.
 
     Parameters
@@ -36,6 +41,8 @@ def serve(path: Path, address: str, say: Callable[[str], None]) -> None:
         See `PageServer`.
     say : callable
         Receives the address for the browser.
+    language : str
+        Language of the page at first.
 
     Raises
     ------
@@ -46,11 +53,30 @@ def serve(path: Path, address: str, say: Callable[[str], None]) -> None:
     page = resources.files(__package__).joinpath("page")
     files = {file.name: file for file in page.iterdir() if file.is_file()}
     with closing(PageServer(files, address, secrets.token_urlsafe(16), lambda _: None)) as server:
+        labels = {name: _labels(name) for name in LANGUAGES}
+        server.keep("hello", json.dumps({"kind": "hello", "language": language, "labels": labels}))
         say(f"page for browsers: {server.url}")
         while True:
             if server.viewers:
                 server.publish(json.dumps(_frame(path)))
             time.sleep(PERIOD_S)
+
+
+def octaves(histogram: Sequence[tuple[int, int]]) -> list[tuple[float, int]]:
+    """Return a histogram of latencies in bins of a factor of two: upper edge, us, and number of samples."""
+    counts: dict[int, int] = {}
+    for upper_ns, count in histogram:
+        k = upper_ns.bit_length()
+        counts[k] = counts.get(k, 0) + count
+    if not counts:
+        return []
+    return [((1 << k) * 1e-3, counts.get(k, 0)) for k in range(min(counts), max(counts) + 1)]
+
+
+def _labels(language: str) -> dict[str, str]:
+    """Return the labels of the page by their names there."""
+    texts = catalogue(language)
+    return {key.removeprefix(_PREFIX): texts[key] for key in texts if key.startswith(_PREFIX)}
 
 
 def _frame(path: Path) -> dict[str, Any]:
@@ -63,8 +89,8 @@ def _frame(path: Path) -> dict[str, Any]:
         "kind": "status",
         "health": status.health,
         "reasons": status.reasons,
-        "rows": list(rows(status)),
-        "latency_us": [round(s * 1e6, 1) for s in status.latency[:4]],
+        "rows": {name: list(rows(status, name)) for name in LANGUAGES},
+        "latency": octaves(status.latency.histogram),
         "rate": float(np.linalg.norm(last.dtheta_b)) / seconds / DEG,
         "force": float(np.linalg.norm(last.dv_b)) / seconds,
         "events": status.events[-5:],

@@ -48,11 +48,11 @@ _HEARTBEAT_S: Final = 5.0
 
 
 class _Viewer:
-    """A connected page: what it has to be sent next."""
+    """A connected page: what it has to be sent next, the newest of each kind only."""
 
     def __init__(self) -> None:
         self.newest = ""
-        self.kept: list[str] = []
+        self.kept: dict[str, str] = {}
         self.wake = asyncio.Event()
 
 
@@ -146,13 +146,13 @@ class PageServer:
     def _keep(self, name: str, text: str) -> None:
         self._kept[name] = text
         for viewer in self._viewers.values():
-            viewer.kept.append(text)
+            viewer.kept[name] = text
             viewer.wake.set()
 
     def _tell_actor(self) -> None:
         for socket, viewer in self._viewers.items():
             acting = {"kind": "acting", "acting": socket is self._actor, "free": self._actor is None}
-            viewer.kept.append(json.dumps(acting))
+            viewer.kept["acting"] = json.dumps(acting)
             viewer.wake.set()
 
     async def _serve(self) -> None:
@@ -160,7 +160,7 @@ class PageServer:
 
         app = web.Application(client_max_size=MOST_BYTES)
         app.router.add_get("/ws", self._socket)
-        app.router.add_get("/{name:[a-z.]*}", self._file)
+        app.router.add_get("/{name:[A-Za-z_.]*}", self._file)
         runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
         await runner.setup()
         self._stop, self._loop = asyncio.Event(), asyncio.get_running_loop()
@@ -192,11 +192,7 @@ class PageServer:
             )
         kind = _TYPES.get(name.rpartition(".")[2], "text/plain")
         if name in self._documents and (content := self._documents[name]()):
-            headers = {
-                **_HEADERS,
-                "Content-Security-Policy": "default-src 'none'; img-src data:; style-src 'unsafe-inline'",
-            }
-            return web.Response(body=content, content_type=kind, charset="utf-8", headers=headers)
+            return web.Response(body=content, content_type=kind, charset="utf-8", headers=_DOCUMENT_HEADERS)
         if name not in self._files:
             return web.Response(status=404, text="no such page\n", headers=_HEADERS)
         return web.Response(body=self._files[name], content_type=kind, charset="utf-8", headers=_HEADERS)
@@ -208,10 +204,11 @@ class PageServer:
             return web.Response(status=403, text="not allowed\n", headers=_HEADERS)
         if len(self._viewers) >= MOST_VIEWERS:
             return web.Response(status=503, text="too many viewers\n", headers=_HEADERS)
-        socket = web.WebSocketResponse(heartbeat=_HEARTBEAT_S, max_msg_size=MOST_BYTES)
+        # Not compressed: that costs more than the bytes, on this machine or in a laboratory.
+        socket = web.WebSocketResponse(heartbeat=_HEARTBEAT_S, max_msg_size=MOST_BYTES, compress=False)
         await socket.prepare(request)
         viewer = _Viewer()
-        viewer.kept += self._kept.values()
+        viewer.kept |= self._kept
         self._viewers[socket] = viewer
         self._actor = self._actor or socket
         self._tell_actor()
@@ -249,8 +246,8 @@ async def _send(socket: "web.WebSocketResponse", viewer: _Viewer) -> None:
         while True:
             await viewer.wake.wait()
             viewer.wake.clear()
-            kept, viewer.kept, newest, viewer.newest = viewer.kept, [], viewer.newest, ""
-            for text in (*kept, *([newest] if newest else [])):
+            kept, viewer.kept, newest, viewer.newest = viewer.kept, {}, viewer.newest, ""
+            for text in (*kept.values(), *([newest] if newest else [])):
                 await socket.send_str(text)
 
 

@@ -2,20 +2,26 @@
 
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 import pytest
 
 from calib.bench.entries import CertificateFile, EmbeddedFile, Plan, from_json, to_json
 from calib.bench.run import RunOptions, run
+from calib.estimation.budget import uncertainty_by_source
+from calib.estimation.joint import estimate_joint
+from calib.estimation.result import TO_DIFFERENCES, LeverArmEstimate
 from calib.identification import IdentificationResult, PriorCalibration, identify
 from calib.lever_arms.gauge import convert
-from calib.messages import message
-from calib.reports.certificate import Particulars, document
-from calib.reports.document import Document, Table
+from calib.messages import LANGUAGES, message
+from calib.reports.certificate import Particulars, documents
+from calib.reports.document import Document, Paragraph, Table
 from calib.reports.html import as_html
 from calib.reports.pdf import BROWSERS, write_pdf
+from imudrv.arrays import Array
 from imudrv.bench import Bench, Instrument, UnitKind
 from imudrv.cli import main as imudrv
 from imudrv.errors import InputError
@@ -33,12 +39,14 @@ BENCH = Bench(
     unit=UnitKind(maker="Example", type="50"),
     instruments=(Instrument(name="gravity survey", certificate="G-1", valid_until="2027-01-31"),),
 )
+Made: TypeAlias = tuple[Particulars, dict[str, Document]]
+WRONG = {"angle_deg": 150.0, "expected_deg": 180.0, "tolerance_deg": 5.0}
 
 
 @pytest.fixture(scope="module")
-def identification(tmp_path_factory: pytest.TempPathFactory) -> IdentificationResult:
+def captures(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """A half turn in each of three poses, of the simulated unit."""
-    folder, captures = tmp_path_factory.mktemp("certificate"), []
+    folder, made = tmp_path_factory.mktemp("certificate"), []
     layout = load_profile("imu50-rs422").layout()
     rest, turn = Segment(rest=Rest(duration_s=40.0)), Segment(rotate=Rotate(angle_deg=180.0, duration_s=2.5))
     for pose in ("z_up", "x_up", "y_up"):
@@ -50,40 +58,47 @@ def identification(tmp_path_factory: pytest.TempPathFactory) -> IdentificationRe
             start=Start(pose=pose),
             motion=(rest, turn, rest),
         )
-        captures.append(folder / f"{pose}.raw")
-        captures[-1].write_bytes(b"".join(data for data, _ in record(scenario, layout)))
+        made.append(folder / f"{pose}.raw")
+        made[-1].write_bytes(b"".join(data for data, _ in record(scenario, layout)))
+    return made
+
+
+@pytest.fixture(scope="module")
+def identification(captures: list[Path]) -> IdentificationResult:
     prior = PriorCalibration(NOMINAL.without_size_effect(), "unit.yaml", "0f" * 32)
     return identify(captures, site=SITE, calibration=prior, profile="imu50-rs422")
 
 
 @pytest.fixture(scope="module")
-def made(identification: IdentificationResult) -> tuple[Particulars, Document]:
+def made(identification: IdentificationResult) -> Made:
     particulars = Particulars(
         number="50-0017-20261126-0123abcd",
         bench=BENCH,
         operator="Wang Li",
-        procedure="three-rotations, SHA-256 0123",
-        measured="2026-11-26",
+        received="2026-11-20",
+        procedure=message("procedure_edition", name="three-rotations", edition="0123", software="imu50 0.1"),
+        measured=("2026-11-25", "2026-11-26"),
         attempts=(
-            ("rejected: x-up, attempt 1", "turned 150.0 deg, want 180 +- 5"),
-            ("skipped: y-up", "by the operator"),
+            (message("attempt_rejected", step="x-up", attempt=1), message("wrong_angle", **WRONG)),
+            (message("step_skipped", step="y-up"), message("by_the_operator")),
         ),
         verified=message("residual_velocity", without_mm_s=90.0, compensated_mm_s=1.0),
-        is_simulated=False,
     )
     arms = identification.arms
-    return particulars, document(identification, (arms, convert(arms, "x")), particulars)
+    return particulars, documents(identification, (arms, convert(arms, "x")), particulars)
 
 
-def test_it_has_every_item_and_names_what_is_blank(made: tuple[Particulars, Document]) -> None:
-    particulars, certificate = made
-    page = as_html(certificate, number=particulars.number)
+def test_it_has_every_item_and_names_what_is_blank(made: Made) -> None:
+    particulars, certificate = made[0], made[1]["en"]
+    page = as_html(certificate, number=particulars.number, watermark="SIMULATED")
     text = re.sub(r"<[^>]+>", " ", page)
     for words in (
         "Calibration certificate 50-0017-20261126-0123abcd",
         "Laboratory &lt;1&gt;",
         "Wang Li",
-        "three-rotations, SHA-256 0123",
+        "three-rotations, edition by SHA-256 0123, imu50 0.1",
+        "2026-11-20",
+        "2026-11-25 to 2026-11-26",
         "gravity survey",
         "coverage probability of about 95 %",
         "Angle: half turns, closed by the direction of gravity and the rotation of the Earth.",
@@ -96,38 +111,101 @@ def test_it_has_every_item_and_names_what_is_blank(made: tuple[Particulars, Docu
         "skipped: y-up",
         "relate only to this item",
         "signature",
-        "Left blank, as not stated: address, bench, authorised by, received.",
+        "Left blank, as not stated: address, bench, authorised by.",
     ):
         assert words in text, words
     assert certificate.sections[-1].title == "End of the certificate"
     assert 'content: "50-0017-20261126-0123abcd"' in page
     assert "counter(page)" in page
-    assert 'class="watermark"' not in page
-    assert '<div class="watermark">SIMULATED</div>' in as_html(certificate, watermark="SIMULATED")
+    assert '<div class="watermark">SIMULATED</div>' in page
+    assert 'class="watermark"' not in as_html(Document("", "", ()))
 
 
-def test_the_sources_add_up_to_the_uncertainty(
-    made: tuple[Particulars, Document], identification: IdentificationResult
+def test_the_lines_of_the_budget_add_up_to_the_stated_uncertainty(
+    made: Made, identification: IdentificationResult
 ) -> None:
-    (section,) = [s for s in made[1].sections if s.title == "Uncertainty budget"]
-    (budget,) = [block for block in section.blocks if isinstance(block, Table)]
-    rows = {row[0]: np.array(row[1:], float) for row in budget.rows}
-    combined, expanded = rows.pop("combined, u"), rows.pop("U, k = 2")
+    (section,) = [s for s in made[1]["en"].sections if s.title == "Uncertainty budget"]
+    inputs, *tables = [block for block in section.blocks if isinstance(block, Table)]
+    result = identification.result
+    for table, covariance in zip(
+        tables, (result.differences_covariance, identification.arms.covariance), strict=True
+    ):
+        rows = {row[0]: np.array(row[1:], float) for row in table.rows}
+        combined, expanded = rows.pop("combined, u"), rows.pop("U, k = 2")
+        assert [row[0] for row in inputs.rows] == list(rows)
+        # of numbers rounded to 0.1 um
+        assert np.sqrt(sum(part**2 for part in rows.values())) == pytest.approx(combined, abs=3e-4)
+        assert combined == pytest.approx(np.sqrt(np.diag(covariance)) / MM, abs=6e-5)
+        assert expanded == pytest.approx(2.0 * combined, abs=2e-4)
+        assert all(part.min() >= 0.0 for part in rows.values())
+    # what the sum over a half turn cancels, or leaves
+    assert rows["accelerometer misalignment"].max() > rows["accelerometer scale factor"].max()
 
-    # of numbers rounded to 0.1 um
-    assert np.sqrt(sum(part**2 for part in rows.values())) == pytest.approx(combined, abs=3e-4)
-    assert combined == pytest.approx(identification.result.differences_sigma.ravel() / MM, abs=6e-5)
-    assert expanded == pytest.approx(2.0 * combined, abs=2e-4)
-    # what the sum over a half turn cancels, or leaves: skew beside noise is the largest
-    assert rows["gyro-accelerometer skew"].max() > rows["accelerometer scale factor"].max()
-    assert all(part.min() >= 0.0 for part in rows.values())
+
+def test_the_sources_add_up_to_the_covariance_also_where_the_errors_are_correlated(
+    identification: IdentificationResult,
+) -> None:
+    runs, priors = identification.runs, identification.priors
+    sigma = np.sqrt(np.diag(priors.shared_covariance))
+    share = np.random.default_rng(7).normal(size=(len(sigma), 3))
+    correlated = replace(
+        priors, covariance=np.diag(sigma**2) + 0.3 * np.outer(sigma, sigma) * (share @ share.T)
+    )
+    for one in (priors, correlated):
+        sources = uncertainty_by_source(runs, one)
+        site, covariance = sources.pop("site"), estimate_joint(runs, one).covariance
+        assert np.trace(site) < 1e-6 * np.trace(covariance)
+        total = sum(sources.values())
+        assert total == pytest.approx(covariance, abs=1e-9 * np.abs(covariance).max())  # of inverse matrices
+        assert ("correlation" in sources) == (one is correlated)
 
 
-def test_a_browser_prints_it_with_pages(made: tuple[Particulars, Document], tmp_path: Path) -> None:
+def test_a_line_is_the_shift_that_the_error_of_its_source_makes(
+    identification: IdentificationResult, captures: list[Path]
+) -> None:
+    runs, priors = identification.runs, identification.priors
+    sources = uncertainty_by_source(runs, priors)
+
+    def stated_mm(source: str) -> Array:
+        return np.sqrt(np.diag(TO_DIFFERENCES @ sources[source] @ TO_DIFFERENCES.T)) / MM
+
+    def shift_mm(other: LeverArmEstimate) -> Array:
+        return np.abs(other.differences - identification.result.differences).ravel() / MM
+
+    skewed = estimate_joint(runs, replace(priors, expected_skew=priors.skew))
+    assert shift_mm(skewed) == pytest.approx(stated_mm("skew"), rel=1e-2)  # what is of second order
+    # the site as if it were known that wrongly: latitude and gravity one after the other
+    moved = []
+    for change in ({"latitude_deg": SITE.latitude_deg + 0.01}, {"gravity_m_s2": SITE.gravity + 50e-5}):
+        site = SITE.model_copy(update=change)
+        prior = identification.prior_calibration
+        moved.append(shift_mm(identify(captures, site=site, calibration=prior, profile="imu50-rs422").result))
+    assert np.hypot(*moved) == pytest.approx(stated_mm("site"), abs=2e-5)  # a tenth of it
+
+
+@pytest.mark.parametrize("language", LANGUAGES)
+def test_the_certificate_is_in_each_language(language: str, made: Made) -> None:
+    certificate, english = made[1][language], made[1]["en"]
+    text = "".join(map(str, certificate.sections))
+    words = {
+        "en": ("combined, u", "rejected: x-up, attempt 1", "turned 150.0 deg"),
+        "zh_CN": ("合成，u", "不合格：x-up，第1次", "转了150.0度"),
+    }
+    for word in words[language]:
+        assert word in text
+    fixed = r"[+-]?\d+\.\d{4}"  # the numbers of results and budget
+    assert re.findall(fixed, str(certificate.sections[2:4])) == re.findall(fixed, str(english.sections[2:4]))
+    if language != "en":
+        for ours in certificate.sections[:8]:
+            paragraphs = [block.text for block in ours.blocks if isinstance(block, Paragraph)]
+            assert not [text for text in paragraphs if re.search("[a-z]{3} [a-z]{2}", text)]
+
+
+def test_a_browser_prints_it_with_pages(made: Made, tmp_path: Path) -> None:
     if not any(map(shutil.which, BROWSERS)):
         pytest.skip("there is no browser on this system")
     page = tmp_path / "page.html"
-    page.write_text(as_html(made[1], number="n", watermark="SIMULATED"))
+    page.write_text(as_html(made[1]["zh_CN"], number="n", watermark="SIMULATED", language="zh_CN"))
     write_pdf(page, tmp_path / "page.pdf")
     assert (tmp_path / "page.pdf").read_bytes().startswith(b"%PDF-")
 

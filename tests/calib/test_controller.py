@@ -475,7 +475,7 @@ def test_the_report_is_there_and_named_once_the_result_is_accepted(
 ) -> None:
     monkeypatch.setattr(controllers, "REDRAW_S", 0.0)
     monkeypatch.setattr(controllers, "decide_alone", lambda _: True)
-    monkeypatch.setattr(completion, "certificate_document", lambda *given: str(given[2].verified.key))
+    monkeypatch.setattr(completion, "certificate_documents", lambda *given: {"en": given[2].verified.key})
     monkeypatch.setattr(completion, "as_html", lambda text, **_: text)
     monkeypatch.setattr(completion, "convert", lambda *_: None)
     keys = Typed(lambda seen: "y" if "[y/n]" in seen else "q" if "Y up" in seen else "")

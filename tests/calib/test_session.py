@@ -328,7 +328,7 @@ def test_every_entry_of_an_older_journal_is_read_and_written_back_the_same(tmp_p
         if "reasons" in line:
             again["reasons"] = [english(Message(**reason)) for reason in again["reasons"]]
         # `samples` and `turns` of an accepted step, `left` of each file, and who calibrates are newer.
-        newer = "samples", "turns", "turns_within_limits", "left", "bench", "operator", "host"
+        newer = "samples", "turns", "turns_within_limits", "left", "bench", "operator", "received", "host"
         new = {key for key in newer if key in again and key not in line}
         assert {k: v for k, v in again.items() if k not in new} == line
 

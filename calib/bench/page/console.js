@@ -141,6 +141,7 @@ function drawText() {
   $("tried").textContent = lost || ended || !view ? "" : view.last_try.map(inLanguage).join("");
   $("big").classList.toggle("rejected", Boolean(rejected) && !lost);
   $("big").dataset.tone = lost ? "bad" : ended ? "good" : view ? view.tone : "wait";
+  $("report").href = `${hello.reports[language]}?token=${encodeURIComponent(token)}`;
   if (asked) $("asked").textContent = inLanguage(hello.questions[asked.action]);
 }
 function drawSteps() {
@@ -251,7 +252,6 @@ const taken = {
     drawResult();
     $("lines").textContent = content.lines.map(inLanguage).join("\n");
     $("report").hidden = false;
-    $("report").href = `report.html?token=${encodeURIComponent(token)}`;
   },
 };
 function connect() {

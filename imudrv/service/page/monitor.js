@@ -4,6 +4,8 @@ const $ = (id) => document.getElementById(id);
 const token = new URLSearchParams(location.search).get("token") || "";
 const KEPT = 240;  // frames in the plots: a minute at 4 Hz
 const values = { rate: [], force: [] };
+let hello = null, frame = null, socket = null, language = "en";
+const label = (name) => (hello ? hello.labels[language][name] : "");
 
 function add(parent, name, text, kind) {
   const made = document.createElement(name);
@@ -30,44 +32,73 @@ function plot(id) {
     h - 4 - (h - 8) * (v - low) / (high - low)));
   pen.stroke();
 }
-function head(health, text) {
-  $("health").dataset.health = health;
-  $("health").textContent = text;
+const digits = (x) => (x < 10 ? x.toFixed(1) : x.toFixed(0));
+const time = (us) => (us < 1000 ? `${digits(us)} µs` : us < 1e6 ? `${digits(us / 1000)} ms` : `${digits(us / 1e6)} s`);
+function drawLatency() {  // the heights are logarithmic: one late sample of millions is seen
+  const most = Math.log2(1 + Math.max(1, ...frame.latency.map(([, count]) => count)));
+  $("latency").replaceChildren();
+  for (const [us, count] of frame.latency) {
+    const bin = add($("latency"), "div", "");
+    add(bin, "span", count ? String(count) : "");
+    add(bin, "i", "").style.height = `${4 * Math.log2(1 + count) / most}rem`;
+    add(bin, "b", time(us));
+  }
+}
+function draw() {
+  for (const one of document.querySelectorAll("[data-label]")) one.textContent = label(one.dataset.label);
+  document.documentElement.lang = language.replace("_", "-");
+  document.title = label("title");
+  const lost = !socket || socket.readyState !== 1, gone = frame && frame.kind === "gone";
+  $("health").dataset.health = lost || gone ? "fail" : frame ? frame.health : "warn";
+  if (lost) $("health").textContent = label("lost");
+  else if (gone) $("health").textContent = `${label("no_service")}: ${frame.text}`;
+  else if (frame)
+    $("health").textContent = `${label(frame.health)}  ${frame.reasons.join("; ") || label("no_problems")}`;
+  if (!frame || gone) return;
+  $("rows").replaceChildren();
+  for (const [name, text, kind] of frame.rows[language]) {
+    const row = add($("rows"), "tr", "");
+    add(row, "td", name);
+    add(row, "td", text, kind);
+  }
+  drawLatency();
+  $("events").textContent = frame.events.join("\n");
+  for (const id of ["rate", "force"]) plot(id);
 }
 const taken = {
   acting() {},
-  gone: (frame) => head("fail", `no service: ${frame.text}`),
-  status(frame) {
-    head(frame.health, `${frame.health.toUpperCase()}  ${frame.reasons.join("; ") || "no problems"}`);
-    $("rows").replaceChildren();
-    for (const [name, text, kind] of frame.rows) {
-      const row = add($("rows"), "tr", "");
-      add(row, "td", name);
-      add(row, "td", text, kind);
-    }
-    $("latency").replaceChildren();
-    const most = Math.max(...frame.latency_us, 1);
-    frame.latency_us.forEach((us, k) => {
-      add($("latency"), "span", ["median", "99 %", "99.9 %", "largest"][k]);
-      add($("latency"), "i", "").style.width = `${100 * us / most}%`;
-      add($("latency"), "span", us.toFixed(0));
-    });
-    $("events").textContent = frame.events.join("\n");
+  hello(content) {
+    hello = content;
+    language = localStorage.getItem("language") || content.language;
+    $("language").value = language;
+    draw();
+  },
+  gone(content) {
+    frame = content;
+    draw();
+  },
+  status(content) {
+    frame = content;
     for (const id of ["rate", "force"]) {
       values[id].push(frame[id]);
       if (values[id].length > KEPT) values[id].shift();
-      plot(id);
     }
+    draw();
   },
 };
+$("language").onchange = (event) => {
+  language = event.target.value;
+  localStorage.setItem("language", language);
+  draw();
+};
 function connect() {
-  const socket = new WebSocket(`${location.origin.replace("http", "ws")}/ws?token=${encodeURIComponent(token)}`);
+  socket = new WebSocket(`${location.origin.replace("http", "ws")}/ws?token=${encodeURIComponent(token)}`);
   socket.onmessage = (event) => {
-    const frame = JSON.parse(event.data);
-    taken[frame.kind](frame);
+    const content = JSON.parse(event.data);
+    taken[content.kind](content);
   };
   socket.onclose = () => {
-    head("fail", "no connection, trying again");
+    draw();
     setTimeout(connect, 1000);
   };
 }
