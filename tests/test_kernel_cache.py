@@ -63,6 +63,23 @@ def program(tmp_path: Path) -> str:
     return str(path)
 
 
+INTERRUPTED = """
+import os, signal
+from llvmlite.binding import ExecutionEngine
+
+calls, find = 0, ExecutionEngine._find_module_ptr
+
+def interrupted(*arguments):
+    global calls
+    calls += 1
+    if calls == {at}:
+        os.kill(os.getpid(), signal.SIGINT)
+    return find(*arguments)
+
+ExecutionEngine._find_module_ptr = interrupted  # called by callbacks of LLVM
+"""
+
+
 def kept(cache: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in cache.rglob("*") if path.is_file()}
 
@@ -125,6 +142,24 @@ def test_a_folder_in_place_of_a_file_is_like_no_folder(program: str, tmp_path: P
     done = run(program, cache=tmp_path / "c")
     assert done.stdout == DONE
     assert done.stderr.count(NOTE) == 1
+
+
+@pytest.mark.parametrize(
+    ("at", "is_compiled"),
+    [(1, True), (2, True), (3, False)],
+    ids=["numba's own code", "a kernel from its file", "a kernel that is compiled"],
+)
+def test_ctrl_c_in_a_callback_of_the_compiler_is_not_lost(
+    program: str, tmp_path: Path, at: int, is_compiled: bool
+) -> None:
+    if is_compiled:
+        run(program, cache=tmp_path / "c")
+    Path(program).write_text(INTERRUPTED.format(at=at) + PROGRAM)
+    done = run(program, cache=tmp_path / "c")
+    assert done.stdout == ""
+    assert done.stderr.endswith("KeyboardInterrupt\n")
+    Path(program).write_text(PROGRAM)
+    assert run(program, cache=tmp_path / "c").stdout == DONE
 
 
 def test_a_full_disk_leaves_no_part_of_a_kernel(program: str, tmp_path: Path) -> None:
