@@ -5,16 +5,19 @@ one never fails: a kernel that cannot be loaded is compiled; one that cannot be 
 start.
 
 It is the only module that uses internals of numba: what `Dispatcher` asks of its cache, how a compiled
-function becomes bytes and is one again, and how the type of a call from another kernel is found.
+function becomes bytes and is one again, how the type of a call from another kernel is found, and where LLVM
+makes machine code.
 """
 
 import hashlib
 import pickle
 import secrets
+import signal
 import sys
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from threading import current_thread, main_thread
 from typing import Any, Final
 
 import numba
@@ -65,6 +68,33 @@ def take_literals_as_variables(dispatcher: Any) -> None:
     dispatcher.get_call_template = get_call_template
 
 
+def _hold_interrupts(engine: Any) -> None:
+    """Let Ctrl-C wait until LLVM has made or taken over the code of a kernel.
+
+    Meanwhile LLVM calls functions of Python that can raise nothing: the interrupt would be lost, and the code
+    of the kernel with it.
+    """
+    if "finalize_object" in vars(engine):
+        return
+    finalize = engine.finalize_object
+
+    def finalize_whole() -> None:
+        raises = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        if not raises or current_thread() is not main_thread():
+            finalize()
+            return
+        caught: list[int] = []
+        signal.signal(signal.SIGINT, lambda number, frame: caught.append(number))
+        try:
+            finalize()
+        finally:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+        if caught:
+            raise KeyboardInterrupt
+
+    engine.finalize_object = finalize_whole
+
+
 class _KernelCache:
     """The cache of one kernel: a file for each signature, that begins with the SHA-256 of the rest."""
 
@@ -75,6 +105,7 @@ class _KernelCache:
 
     def load_overload(self, signature: Any, target: Any) -> Any:
         """Return the compiled function; None if there is none that is whole."""
+        _hold_interrupts(target.codegen()._engine)  # noqa: SLF001
         target.refresh()
         if self._folder is None:
             return None

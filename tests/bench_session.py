@@ -20,6 +20,18 @@ version: 1
 name: two
 poses: [{id: z-up, up: +Z, east: +X, turn_deg: 180}, {id: x-up, up: +X, east: +Y, turn_deg: 180}]
 """
+SHORT = """
+format: imu50-procedure
+version: 1
+name: short
+align_s: 30
+rest_s: 4
+poses:
+  - {id: z-up, up: +Z, east: +X, turn_deg: 180}
+  - {id: x-up, up: +X, east: +Y, turn_deg: 180}
+  - {id: y-up, up: +Y, east: +Z, turn_deg: 180}
+"""
+"""Three poses with the shortest alignment, for rehearsals."""
 ACCEPTED = {
     "first_counter": 1000,
     "last_counter": 1899,

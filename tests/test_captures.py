@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zstandard
+from realtime import DEADLINE_S
 
 import imudrv
 from imudrv.cli import main
@@ -206,7 +207,9 @@ def test_the_command_says_what_it_read_or_why_not(
     logs: Path, tmp_path: Path, name: str, arguments: list[str], code: int, message: str
 ) -> None:
     command = [sys.executable, "-m", "imudrv", "decode", str(logs / name), *arguments, "-o", "out.csv"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, timeout=DEADLINE_S, check=False
+    )
     assert done.returncode == code
     assert message in (done.stderr if code else done.stdout)
     assert (tmp_path / "out.csv").exists() == (code == 0)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from realtime import DEADLINE_S
 
 from calib.cli import main as calib
 from imudrv.calibration import write_calibration
@@ -133,7 +134,7 @@ def test_a_channel_of_what_is_no_can_log_is_refused(
     service = ["run", "--port", "replay://can0.log?speed=max", *PROFILE, *CALIBRATION]
     service += ["--record", "unit.mcap", "--status", "status.sock"]
     if not Path("unit.mcap").exists():
-        subprocess.run([sys.executable, "-m", "imudrv", *service], check=True, timeout=300)
+        subprocess.run([sys.executable, "-m", "imudrv", *service], check=True, timeout=DEADLINE_S)
     capsys.readouterr()
     main, before, after = COMMANDS[command]
     for name, profile, what in (
@@ -181,4 +182,4 @@ def serve(url: str) -> subprocess.CompletedProcess[str]:
     """Run the service to the end of a replay, with its increments in out.csv."""
     command = [sys.executable, "-m", "imudrv", "run", "--port", url, *PROFILE, *CALIBRATION]
     command += ["--out", "file:out.csv", "--status", "status.sock"]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=DEADLINE_S, check=False)

@@ -2,6 +2,7 @@
 
 import os
 import resource
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from imudrv import profiles
+from imudrv.kernels import FOLDER
 from imudrv.records import PULSES
 from imudrv.wire.encode import StreamEncoder
 
@@ -61,6 +63,23 @@ def program(tmp_path: Path) -> str:
     path = tmp_path / "program.py"
     path.write_text(PROGRAM)
     return str(path)
+
+
+INTERRUPTED = """
+import os, signal
+from llvmlite.binding import ExecutionEngine
+
+calls, find = 0, ExecutionEngine._find_module_ptr
+
+def interrupted(*arguments):
+    global calls
+    calls += 1
+    if calls == {at}:
+        os.kill(os.getpid(), signal.SIGINT)
+    return find(*arguments)
+
+ExecutionEngine._find_module_ptr = interrupted  # called by callbacks of LLVM
+"""
 
 
 def kept(cache: Path) -> dict[Path, bytes]:
@@ -127,6 +146,24 @@ def test_a_folder_in_place_of_a_file_is_like_no_folder(program: str, tmp_path: P
     assert done.stderr.count(NOTE) == 1
 
 
+@pytest.mark.parametrize(
+    ("at", "is_compiled"),
+    [(1, True), (2, True), (3, False)],
+    ids=["numba's own code", "a kernel from its file", "a kernel that is compiled"],
+)
+def test_ctrl_c_in_a_callback_of_the_compiler_is_not_lost(
+    program: str, tmp_path: Path, at: int, is_compiled: bool
+) -> None:
+    if is_compiled:
+        run(program, cache=tmp_path / "c")
+    Path(program).write_text(INTERRUPTED.format(at=at) + PROGRAM)
+    done = run(program, cache=tmp_path / "c")
+    assert done.stdout == ""
+    assert done.stderr.endswith("KeyboardInterrupt\n")
+    Path(program).write_text(PROGRAM)
+    assert run(program, cache=tmp_path / "c").stdout == DONE
+
+
 def test_a_full_disk_leaves_no_part_of_a_kernel(program: str, tmp_path: Path) -> None:
     done = run(program, cache=tmp_path / "c", file_limit=1000)
     assert done.stdout == DONE
@@ -140,6 +177,11 @@ def test_a_full_disk_of_the_kernels_is_not_blamed_on_the_output(tmp_path: Path) 
     samples = np.zeros(20, PULSES)
     samples["counter"] = np.arange(20)
     capture.write_bytes(StreamEncoder(layout).encode(samples).tobytes())
+    if FOLDER is not None and FOLDER.is_dir():  # only one kernel has to be compiled
+        folder = tmp_path / "c" / "imu50" / FOLDER.name
+        shutil.copytree(FOLDER, folder)
+        for path in folder.glob("imudrv.imu.sequence.track-*"):
+            path.unlink()
     command = "-m", "imudrv", "decode", str(capture), "--profile", "imu50-rs422", "-o", str(output)
     done = run(*command, cache=tmp_path / "c", file_limit=5000)
     assert done.returncode == 0, done.stderr

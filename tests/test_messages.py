@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from realtime import DEADLINE_S
 from rich.text import Text
 from samples import CERTIFICATE
 
@@ -34,7 +35,7 @@ def run(arguments: list[str], more: str = "", **environment: str) -> subprocess.
         ["sh", "-c", command, sys.executable, *arguments],
         env={**os.environ, **environment},
         capture_output=True,
-        timeout=300,
+        timeout=DEADLINE_S,
         check=False,
     )
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from realtime import DEADLINE_S
 from samples import record
 
 import imudrv
@@ -63,7 +64,7 @@ def test_importing_the_package_loads_no_large_library_and_the_calibration_no_ker
         "import sys, imudrv; assert not {'numba', 'numpy', 'pydantic'} & set(sys.modules), 'imudrv'; "
         "import imudrv.calibration; assert 'numba' not in sys.modules, 'imudrv.calibration'"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=300)
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=DEADLINE_S)
 
 
 def test_every_public_name_exists_and_no_other_is_listed() -> None:
@@ -72,7 +73,7 @@ def test_every_public_name_exists_and_no_other_is_listed() -> None:
         "assert dir(imudrv) == sorted(imudrv.__all__); "
         "assert {type(getattr(imudrv, name)).__name__ for name in dir(imudrv)}.isdisjoint({'module'})"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=300)
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=DEADLINE_S)
     with pytest.raises(AttributeError, match="'imudrv' has no attribute 'Captur'"):
         _ = imudrv.Captur  # type: ignore[attr-defined]
 

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from realtime import DEADLINE_S
 
 from calib.cli import main as calib
 from imudrv.calibration import read_calibration, write_calibration
@@ -94,7 +95,7 @@ def process(arguments: str) -> list[str]:
 
 
 def piped(arguments: str, folder: Path) -> subprocess.CompletedProcess[bytes]:
-    return subprocess.run(process(arguments), cwd=folder, check=True, capture_output=True, timeout=300)
+    return subprocess.run(process(arguments), cwd=folder, check=True, capture_output=True, timeout=DEADLINE_S)
 
 
 def make(kind: str, path: Path) -> None:
@@ -228,7 +229,7 @@ def test_standard_output_has_a_second_name(here: Path) -> None:
     assert done.stderr == to_file.stdout.replace(b"out.csv", b"/dev/stdout")
     with (here / "redirected").open("wb") as file:
         command = process("decode run.npz --profile own.csv -o /dev/stdout")
-        subprocess.run(command, stdout=file, stderr=subprocess.DEVNULL, check=True, timeout=300)
+        subprocess.run(command, stdout=file, stderr=subprocess.DEVNULL, check=True, timeout=DEADLINE_S)
     assert (here / "redirected").read_bytes() == content
     with pytest.raises(InputError, match="cannot go to standard output"):
         file_to_write(Path("/dev/stdout"))
@@ -251,7 +252,7 @@ def test_options_invalid_on_standard_output_are_refused_in_a_line(
 def test_a_full_standard_output_is_reported_and_a_closed_pipe_is_no_fault(here: Path) -> None:
     command = process("decode run.npz --profile own.csv -o -")
     with open("/dev/full", "wb") as full:
-        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, timeout=300, check=False)
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, timeout=DEADLINE_S, check=False)
     assert (done.returncode, done.stderr) == (
         2,
         b"error: standard output: cannot be written: No space left on device\n",
@@ -259,14 +260,14 @@ def test_a_full_standard_output_is_reported_and_a_closed_pipe_is_no_fault(here: 
     begun = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert begun.stdout is not None
     begun.stdout.close()  # as head does
-    _, errors = begun.communicate(timeout=300)
+    _, errors = begun.communicate(timeout=DEADLINE_S)
     assert (begun.returncode, errors) == (0, b"")
 
 
 def test_an_output_that_is_redirected_onto_its_input_is_refused(here: Path, made: dict[str, bytes]) -> None:
     with (here / "run.npz").open("ab") as file:
         command = process("decode run.npz --profile own.csv -o -")
-        done = subprocess.run(command, stdout=file, stderr=subprocess.PIPE, timeout=300, check=False)
+        done = subprocess.run(command, stdout=file, stderr=subprocess.PIPE, timeout=DEADLINE_S, check=False)
     assert done.returncode == 2
     assert b"-: expected an output apart from its input run.npz" in done.stderr
     assert (here / "run.npz").read_bytes() == made["run.npz"]

@@ -199,22 +199,13 @@ def test_a_rehearsal_in_fast_time_is_not_reported_as_a_wrong_rate(undisturbed: t
     ],
 )
 def test_units_of_other_makers_give_arms_as_good_from_their_recordings(profile: str, tmp_path: Path) -> None:
-    (tmp_path / "short.yaml").write_text(PROCEDURE)
-    options = ["--rehearse", "--speed", "max", "--profile", profile, "--procedure", "short.yaml"]
-    calib = [sys.executable, "-m", "calib"]
-    for command in (["run", *options, "--session", "session"], ["verify", "session"]):
-        process = subprocess.Popen(
-            [*calib, *command],
-            cwd=tmp_path,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        said = ended(process)
-    assert "the recordings give the certificate, digit for digit" in said
-    check_true(tmp_path / "session")
-    certificate = read_calibration(tmp_path / "session" / "certificate.yaml")
+    folder = tmp_path / "session"
+    ended(start(folder, program=RUN.replace("rehearse=True", f"rehearse=True, profile={profile!r}")))
+    verified = verify(folder)
+    assert verified.faults == ()
+    assert "the recordings give the certificate, digit for digit" in verified.notes
+    check_true(folder)
+    certificate = read_calibration(folder / "certificate.yaml")
     assert certificate.gyro.scale == certificate.accelerometer.scale == (1.0, 1.0, 1.0)
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from realtime import DEADLINE_S
 from samples import CERTIFICATE
 
 import calib
@@ -176,7 +177,7 @@ def test_recordings_bring_their_own_profile_and_calibration(
         service = ["run", "--port", f"sim://{name}.yaml?speed=max", "--profile", "imu50-rs422"]
         service += ["--calibration", "unit.yaml", "--record", f"{name}.mcap", "--status", "status.sock"]
         subprocess.run(
-            [sys.executable, "-m", "imudrv", *service], check=True, capture_output=True, timeout=300
+            [sys.executable, "-m", "imudrv", *service], check=True, capture_output=True, timeout=DEADLINE_S
         )
     recordings = ["identify", "z.mcap", "x.mcap", "y.mcap", "--site", "site.yaml", "-o", "recorded.yaml"]
     assert main(recordings) == 0
@@ -233,7 +234,7 @@ def test_a_certificate_that_the_data_contradict_is_refused_but_the_report_is_the
 def test_a_reader_who_leaves_early_does_not_cost_the_certificate(here: Path) -> None:
     options = "--profile imu50-rs422 --calibration unit.yaml --site site.yaml -o piped.yaml"
     command = f"{sys.executable} -m calib identify {' '.join(CAPTURES)} {options} | head -n 1"
-    subprocess.run(command, shell=True, cwd=here, check=True, capture_output=True, timeout=300)
+    subprocess.run(command, shell=True, cwd=here, check=True, capture_output=True, timeout=DEADLINE_S)
     assert (here / "piped.yaml").exists()
 
 
@@ -413,7 +414,9 @@ def test_the_reference_captures_through_the_real_command(reference: Path, tmp_pa
     command += ["--profile", "imu50-rs422", "--calibration", str(reference / "calibration.yaml")]
     command += ["--site", str(reference / "site.yaml"), "--unit", "50-0017"]
     command += ["-o", "new.yaml", "--json", "r.json", "--report", "r.html"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, timeout=DEADLINE_S, check=False
+    )
     assert done.returncode == 0, done.stderr
     truth = yaml.safe_load((reference / "truth.yaml").read_text())["r_mm"]
     new = yaml.safe_load((tmp_path / "new.yaml").read_text())["size_effect"]

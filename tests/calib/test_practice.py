@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bench_session import SHORT
 from realtime import DEADLINE_S
 
 from calib.bench.run import RunOptions, run
@@ -21,25 +22,12 @@ from calib.procedure.plan import load
 from imudrv.errors import InputError
 from imudrv.terminal import console
 
-PROCEDURE = """
-format: imu50-procedure
-version: 1
-name: short
-align_s: 30
-rest_s: 4
-poses:
-  - {id: z-up, up: +Z, east: +X, turn_deg: 180}
-  - {id: x-up, up: +X, east: +Y, turn_deg: 180}
-  - {id: y-up, up: +Y, east: +Z, turn_deg: 180}
-"""
-
-
 ASKED = re.compile(r"PRESS ENTER|REJECTED|\[y/n\]|step 1 of 1")  # the last: the verification, which is left
 
 
 def practised(folder: Path, mistakes: str) -> tuple[int, str]:
     """Exit code and output of a rehearsal; the keys are those that the screen asks for."""
-    (folder / "short.yaml").write_text(PROCEDURE)
+    (folder / "short.yaml").write_text(SHORT)
     master, slave = pty.openpty()
     command = [sys.executable, "-m", "calib", "run", "--rehearse", "--keys", "--mistakes", mistakes]
     command += ["--speed", "20", "--procedure", "short.yaml", "--session", "s"]

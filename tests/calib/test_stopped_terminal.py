@@ -10,22 +10,12 @@ from threading import Event, Thread
 from typing import Any
 
 import realtime
+from bench_session import SHORT
 
 from calib.bench.state import JOURNAL
 from calib.bench.verify import verify
 
-PROCEDURE = """
-format: imu50-procedure
-version: 1
-name: short
-align_s: 40
-rest_s: 8
-poses:
-  - {id: z-up, up: +Z, east: +X, turn_deg: 180}
-  - {id: x-up, up: +X, east: +Y, turn_deg: 180}
-  - {id: y-up, up: +Y, east: +Z, turn_deg: 180}
-"""
-SPEED = 10
+SPEED = 15
 CTRL_S, CTRL_Q = b"\x13", b"\x11"
 
 
@@ -57,7 +47,7 @@ def journal(folder: Path) -> list[dict[str, Any]]:
 
 def test_a_terminal_that_accepts_no_output_for_a_whole_step_costs_no_data(tmp_path: Path) -> None:
     procedure, folder, terminal = tmp_path / "short.yaml", tmp_path / "session", Terminal()
-    procedure.write_text(PROCEDURE)
+    procedure.write_text(SHORT)
     command = ["run", "--rehearse", "--speed", str(SPEED), "--procedure", str(procedure)]
     process = subprocess.Popen(
         [sys.executable, "-m", "calib", *command, "--session", str(folder)],

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from realtime import DEADLINE_S
 
 from calib.certificate import lever_arms_of
 from calib.cli import main as calib
@@ -355,7 +356,7 @@ def test_the_commands_give_the_same_bits_for_all_four_motions(tmp_path: Path) ->
 
     def imudrv(*arguments: str) -> None:
         command = [sys.executable, "-m", "imudrv", *arguments]
-        subprocess.run(command, cwd=tmp_path, check=True, timeout=300, capture_output=True)
+        subprocess.run(command, cwd=tmp_path, check=True, timeout=DEADLINE_S, capture_output=True)
 
     common = ["--profile", "imu50-rs422", "--calibration", "unit.yaml"]
     imudrv("run", "--port", "sim://run.yaml?speed=max", *common, "--out", "file:live.i50n", "--status", "a")

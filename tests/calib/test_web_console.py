@@ -12,23 +12,13 @@ from threading import Timer
 from typing import Any
 
 import pytest
+from bench_session import SHORT
 from realtime import DEADLINE_S, until
 
 playwright = pytest.importorskip("playwright.sync_api", reason="the package playwright is not installed")
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this system")
 
-PROCEDURE = """
-format: imu50-procedure
-version: 1
-name: short
-align_s: 30
-rest_s: 4
-poses:
-  - {id: z-up, up: +Z, east: +X, turn_deg: 180}
-  - {id: x-up, up: +X, east: +Y, turn_deg: 180}
-  - {id: y-up, up: +Y, east: +Z, turn_deg: 180}
-"""
 DEADLINE_MS = DEADLINE_S * 1e3
 
 
@@ -37,7 +27,7 @@ class Bench:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        (folder / "short.yaml").write_text(PROCEDURE)
+        (folder / "short.yaml").write_text(SHORT)
         self.port = "0"
         self.start("--procedure", "short.yaml", "--mistakes", "wrong-way")
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from realtime import DEADLINE_S
 
 from calib.cli import main as calib
 from imudrv import Capture, profiles
@@ -59,7 +60,7 @@ def pipe_of(data: bytes, path: Path) -> Iterator[Path]:
     thread = threading.Thread(target=write, daemon=True)
     thread.start()
     yield path
-    thread.join(30)
+    thread.join(DEADLINE_S)
     assert not thread.is_alive()
 
 
@@ -104,7 +105,9 @@ def test_a_pipe_is_read_once(wire: dict[str, bytes], tmp_path: Path) -> None:
 
 def test_standard_input_is_a_capture_too(wire: dict[str, bytes], tmp_path: Path) -> None:
     command = [sys.executable, "-m", "imudrv", "decode", "/dev/stdin", "-o", str(tmp_path / "out.npz")]
-    done = subprocess.run(command, input=wire["imu50-can"], capture_output=True, check=True, timeout=300)
+    done = subprocess.run(
+        command, input=wire["imu50-can"], capture_output=True, check=True, timeout=DEADLINE_S
+    )
     assert b"40000 good" in done.stdout
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from realtime import DEADLINE_S
 
 from imudrv.errors import InputError
 from imudrv.imu.coefficients import Coefficients, TemperatureTerms
@@ -200,7 +201,7 @@ def test_without_the_compiler_the_bits_are_the_same():
         env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
         capture_output=True,
         check=False,
-        timeout=300,
+        timeout=DEADLINE_S,
     )
     assert run.returncode == 0, run.stderr.decode()
     for pieces, name in zip(pickle.loads(run.stdout), NAMES, strict=True):
