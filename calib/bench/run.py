@@ -273,18 +273,12 @@ def conduct(session: Session, options: RunOptions, console: Console, web: WebCon
             if simulated is not None:
                 simulated.end()
             if not controller.outcome:
-                for line in accepted_result(session):
-                    options.say(console, line)
-                options.say(console, message("accepted_steps", steps=steps_message(session)))
-                options.say(console, message("resume_with", folder=str(session.folder)))
+                _show_end(_unfinished(session), options, console, web)
     if controller.error is not None:
         raise controller.error
     if not controller.outcome:
         return NOT_GOOD if controller.is_undecided else INTERRUPTED
-    for line in controller.outcome:
-        options.say(console, line)
-    if web is not None:
-        web.end(controller.outcome)
+    _show_end(controller.outcome, options, console, web)
     for name in REPORTS.values():
         if options.pdf and name in session.files:
             report = session.folder / name
@@ -296,6 +290,20 @@ def conduct(session: Session, options: RunOptions, console: Console, web: WebCon
         against = comparison(found, simulated.truth(layout), "the simulated unit")
         console.print(as_text(against), markup=False, highlight=False, soft_wrap=True)
     return OK
+
+
+def _unfinished(session: Session) -> tuple[Message, ...]:
+    steps = message("accepted_steps", steps=steps_message(session))
+    return (*accepted_result(session), steps, message("resume_with", folder=str(session.folder)))
+
+
+def _show_end(
+    lines: Sequence[Message], options: RunOptions, console: Console, web: WebConsole | None
+) -> None:
+    for line in lines:
+        options.say(console, line)
+    if web is not None:
+        web.end(lines)
 
 
 def _ask() -> bool:

@@ -4,6 +4,7 @@ import json
 import os
 import re
 import secrets
+from collections.abc import Sequence
 from functools import partial
 from importlib import resources
 from pathlib import Path
@@ -131,7 +132,7 @@ class WebConsole:
         """Take the question away."""
         self._keep("result", {})
 
-    def end(self, outcome: tuple[Message, ...]) -> None:
+    def end(self, outcome: Sequence[Message]) -> None:
         """Show how the session has ended."""
         self._keep("end", {"lines": [_texts(line) for line in outcome]})
 

@@ -16,7 +16,7 @@ from imudrv.bench import Bench
 from imudrv.calibration import Calibration
 from imudrv.units import MM
 
-_LINE: Final = "_" * 30
+_LINE: Final = "_" * 24
 """Where a person writes."""
 
 
@@ -212,11 +212,8 @@ def _deviations(given: Particulars, say: Say) -> Iterator[Block]:
 
 
 def _signatures(given: Particulars, say: Say) -> Iterator[Block]:
-    names = (
-        message("signed_operator", name=sanitise(given.operator)),
-        message("signed_authorised", name=sanitise(given.bench.authorised_by)),
-    )
-    line = say(message("signature_line", line=_LINE))
-    yield KeyValues(tuple((say(name).strip(), line) for name in names))
+    operator, authorised = sanitise(given.operator), sanitise(given.bench.authorised_by)
+    yield Paragraph(say(message("signed_operator", name=operator, line=_LINE)))
+    yield Paragraph(say(message("signed_authorised", name=authorised, line=_LINE)))
     yield Paragraph(say(message("only_in_full")))
     yield Paragraph(say(message("annex_language")))

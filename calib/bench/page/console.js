@@ -88,11 +88,13 @@ function drawPlot(id) {
   const w = canvas.clientWidth * scale, h = canvas.clientHeight * scale;
   if (canvas.width !== w || canvas.height !== h) [canvas.width, canvas.height] = [w, h];
   const pen = canvas.getContext("2d"), style = getComputedStyle(document.documentElement);
-  let low = Math.min(...values), high = Math.max(...values);
+  const known = values.filter((v) => v !== null);
+  let low = Math.min(...known), high = Math.max(...known);
   if (id === "stillness") [low, high] = [0, 1];
-  const least = { rate: 5, force: 0.1, stillness: 1 }[id];
-  if (high - low < least) [low, high] = [(low + high - least) / 2, (low + high + least) / 2];
+  if (id === "rate") [low, high] = [0, Math.max(5, high)];
+  if (id === "force" && high - low < 0.1) [low, high] = [(low + high - 0.1) / 2, (low + high + 0.1) / 2];
   pen.clearRect(0, 0, w, h);
+  if (!known.length) return;
   pen.fillStyle = style.getPropertyValue("--dim");
   pen.font = `${11 * scale}px sans-serif`;
   const shown = (v) => v.toFixed(id === "rate" ? 0 : 2), room = 42 * scale, y = (v) => h - 4 - (h - 8) * (v - low) / (high - low);
@@ -101,7 +103,7 @@ function drawPlot(id) {
   pen.strokeStyle = style.getPropertyValue("--do");
   pen.lineWidth = 1.5 * scale;
   pen.beginPath();
-  values.forEach((v, k) => pen.lineTo(room + (w - room) * (k + KEPT - values.length) / KEPT, y(v)));
+  values.forEach((v, k) => v !== null && pen.lineTo(room + (w - room) * (k + KEPT - values.length) / KEPT, y(v)));
   pen.stroke();
 }
 function beep(frequency, seconds) {
@@ -167,6 +169,7 @@ function drawButtons() {
 function drawResult() {
   const showing = Boolean((result && result.r_mm) || ended);
   $("live").hidden = showing;
+  for (const action of ["confirm", "redo", "skip", "abort"]) $(action).hidden = showing;
   $("outcome").hidden = !showing;
   $("ask").hidden = !(result && result.r_mm) || !acting;
   for (const id of ["arms", "verdicts", "points"]) $(id).replaceChildren();
@@ -208,7 +211,7 @@ function frame() {
   draw();
   drawPose();
   drawDial();
-  for (const [id, value] of [["rate", Math.abs(view.rate)], ["force", view.force || 0], ["stillness", view.stillness]]) {
+  for (const [id, value] of [["rate", Math.abs(view.rate)], ["force", view.force], ["stillness", view.stillness]]) {
     history[id].push(value);
     if (history[id].length > KEPT) history[id].shift();
     drawPlot(id);
@@ -310,7 +313,7 @@ addEventListener("keydown", (event) => {
 });
 function fit() {
   const scene = $("scene");
-  $("world").style.setProperty("--scale", Math.min(scene.clientWidth / 500, scene.clientHeight / 400));
+  $("world").style.setProperty("--scale", Math.min(scene.clientWidth / 500, scene.clientHeight / 470));
 }
 addEventListener("resize", fit);
 const wanted = localStorage.getItem("theme")

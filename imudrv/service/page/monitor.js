@@ -16,10 +16,11 @@ function add(parent, name, text, kind) {
 }
 function plot(id) {
   const canvas = $(id), scale = devicePixelRatio || 1, style = getComputedStyle(document.documentElement);
-  const w = canvas.clientWidth * scale, h = canvas.clientHeight * scale, least = id === "rate" ? 1 : 0.1;
+  const w = canvas.clientWidth * scale, h = canvas.clientHeight * scale, least = 1;
   [canvas.width, canvas.height] = [w, h];
   let low = Math.min(...values[id]), high = Math.max(...values[id]);
-  if (high - low < least) [low, high] = [(low + high - least) / 2, (low + high + least) / 2];
+  if (id === "rate") low = 0;
+  if (high - low < least) [low, high] = id === "rate" ? [0, least] : [(low + high - least) / 2, (low + high + least) / 2];
   const pen = canvas.getContext("2d"), room = 46 * scale;
   pen.fillStyle = style.getPropertyValue("--dim");
   pen.font = `${11 * scale}px sans-serif`;
