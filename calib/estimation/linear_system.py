@@ -89,6 +89,7 @@ class RunEquations(NamedTuple):
     """Whitened equations of a run, `v = A @ (R, shared, own, steps)`."""
 
     L: Array  # (n, n), Cholesky factor of the covariance of the noise
+    walk: Array  # (n, n), part of that covariance by the random walk of velocity
     A: Array
     v: Array  # (n,)
     accepted: tuple[bool, ...]  # of each turn
@@ -147,10 +148,10 @@ def run_equations(run: Run, noise: SensorNoise, pivot: str, design: Design) -> R
         variance = np.concatenate([variance, np.full(len(t) - len(variance), coarse)])
     passed = np.concatenate([readings.arrest, np.zeros(len(t) - len(readings.arrest), np.int64)])
     pulses = d @ readings.start @ d.T + np.minimum.outer(passed, passed) * (d @ readings.turn @ d.T)
-    K = walk_covariance(t, d, noise, run.gravity) + pulses + np.diag(variance)
-    L = np.asarray(np.linalg.cholesky(K), np.float64)
+    walk, tilt = walk_covariances(t, d, noise, run.gravity)
+    L = np.asarray(np.linalg.cholesky(walk + tilt + pulses + np.diag(variance)), np.float64)
     white = solve_triangular(L, np.column_stack([A, v]), lower=True)
-    return RunEquations(L, white[:, :-1], white[:, -1], tuple(turn.accepted for turn in run.turns))
+    return RunEquations(L, walk, white[:, :-1], white[:, -1], tuple(turn.accepted for turn in run.turns))
 
 
 def _motion(run: Run, design: Design) -> tuple[Array, Array, Array, Array]:
@@ -169,12 +170,12 @@ def _motion(run: Run, design: Design) -> tuple[Array, Array, Array, Array]:
     )
 
 
-def walk_covariance(t: Array, d: Array, noise: SensorNoise, gravity: float) -> Array:
-    """Return the covariance of the random walks at the times t along the directions d."""
+def walk_covariances(t: Array, d: Array, noise: SensorNoise, gravity: float) -> tuple[Array, Array]:
+    """Return the covariances of the walks of velocity and of tilt at the times t along the directions d."""
     s, u = np.minimum.outer(t, t), np.maximum.outer(t, t)
     tilt = (gravity * noise.angle_walk) ** 2 * s * s * (3.0 * u - s) / 6.0
     level = d[:, :2]
-    return np.asarray(noise.velocity_walk**2 * s * (d @ d.T) + tilt * (level @ level.T), np.float64)
+    return noise.velocity_walk**2 * s * (d @ d.T), tilt * (level @ level.T)
 
 
 class NormalEquations:
@@ -248,6 +249,15 @@ class NormalEquations:
     def chi_square(self, x: Array) -> float:
         """Return chi-square of the residuals and the priors."""
         return float(self._yy - 2.0 * self.b @ x + x @ self.N @ x)
+
+    def walk_share(self, x: Array) -> float:
+        """Return the share of the random walk of velocity in chi-square, -d ln(chi-square) / d ln(q_v^2)."""
+        total = 0.0
+        for k, part in enumerate(self.parts):
+            residual = part.v - part.A @ x[self.columns_of(k)]
+            z = solve_triangular(part.L, residual, lower=True, trans="T")
+            total += float(z @ part.walk @ z)
+        return total / self.chi_square(x)
 
     def with_pivots(self, sigma: float) -> "NormalEquations":
         """Return the equations with a shift of the origin of b in each run, 1-sigma in m."""
