@@ -2,6 +2,7 @@
 
 tools/run python tools/montecarlo.py --cases 200 --skew-sigma-ms 0
 tools/run python tools/montecarlo.py --budget coarse-pulses --signs both --cases 20
+tools/run python tools/montecarlo.py --budget ten-turns --cases 10 --skew-sigma-ms 0 --bound
 tools/run python tools/montecarlo.py --search 100
 
 Seeds below 1000 were used to tune the estimate; reports begin at 1000.
@@ -14,6 +15,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import asdict, replace
 from typing import Any, NamedTuple
 
+import numpy as np
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -25,6 +27,7 @@ from calib.estimation.result import LeverArmEstimate
 from calib.identification import CaptureSummary, IdentificationResult, PriorCalibration
 from calib.messages import english
 from calib.reports.verdict import verdict
+from calib.validation.bound import sigma_over_bound
 from calib.validation.montecarlo import (
     BUDGETS,
     SITE,
@@ -49,6 +52,7 @@ class Outcome(NamedTuple):
     reason: str
     estimate: LeverArmEstimate | None
     truth: Array
+    over_bound: float = 0.0  # sigma over that of the Cramer-Rao bound, where it is wanted
 
     @property
     def usable(self) -> bool:
@@ -61,12 +65,13 @@ class Outcome(NamedTuple):
         return 0.0 if self.estimate is None else worst_sigma(self.estimate, self.truth)
 
 
-def outcome(seed: int, budget: Budget) -> Outcome:
-    """Identify a unit."""
+def outcome(seed: int, budget: Budget, *, bound: bool = False) -> Outcome:
+    """Identify a unit; and compare its covariance with the bound."""
     truth = true_arms(seed, budget)
     try:
         found = captures(seed, budget)
-        estimate = estimate_joint([run for capture in found for run in capture.runs], budget.priors)
+        runs = [run for capture in found for run in capture.runs]
+        estimate = estimate_joint(runs, budget.priors)
     except InputError as error:
         return Outcome("refused", str(error), None, truth)
     sources = tuple(CaptureSummary("case", "case", "", budget.profile, "", (), capture) for capture in found)
@@ -75,7 +80,8 @@ def outcome(seed: int, budget: Budget) -> Outcome:
         IdentificationResult(estimate, known, SITE, RotationLimits(), budget.priors, sources)
     )
     worst = next(mark for mark in marks if mark.level == overall.level)
-    return Outcome(overall.level, english(worst.text), estimate, truth)
+    over_bound = sigma_over_bound(estimate, runs, budget.priors) if bound else 0.0
+    return Outcome(overall.level, english(worst.text), estimate, truth, over_bound)
 
 
 def search(seeds: Iterable[int]) -> Iterator[tuple[int, Outcome]]:
@@ -99,6 +105,8 @@ def main() -> None:
     text = "seed of the first case (default: %(default)s; tuned on seeds below)"
     parser.add_argument("--seed", type=int, default=FIRST_SEED, help=text)
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    text = "also compare the stated covariance with the Cramer-Rao bound of the same noise and priors"
+    parser.add_argument("--bound", action="store_true", help=text)
     text = "instead: N cases with conditions drawn at random, and the worst errors among them"
     parser.add_argument("--search", type=int, metavar="N", help=text)
     options = parser.parse_args()
@@ -115,7 +123,7 @@ def main() -> None:
     budget = replace(budget, priors=replace(budget.priors, skew=options.skew_sigma_ms * 1e-3))
     if options.signs:
         budget = replace(budget, signs=(1,) if options.signs == "one" else (1, -1))
-    _print_statistics(options, budget, [outcome(seed, budget) for seed in shown])
+    _print_statistics(options, budget, [outcome(seed, budget, bound=options.bound) for seed in shown])
 
 
 def _print_statistics(options: Any, budget: Budget, found: list[Outcome]) -> None:
@@ -123,6 +131,8 @@ def _print_statistics(options: Any, budget: Budget, found: list[Outcome]) -> Non
     usable = [(one.estimate, one.truth) for one in found if one.estimate is not None and one.usable]
     levels = dict(Counter(one.level for one in found))
     row = asdict(statistics("joint", usable)) if usable else {}
+    if options.bound and usable:
+        row["sigma_over_bound"] = float(np.mean([one.over_bound for one in found if one.usable]))
     if options.json:
         print(
             json.dumps({"budget": options.budget, "signs": budget.signs, "verdicts": levels, **row}, indent=1)

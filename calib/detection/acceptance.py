@@ -23,7 +23,8 @@ class RotationLimits:
     angle_deg, angle_tolerance_deg : float
         Angle about the vertical, of either sign.
     least_peak_deg_per_s : float
-        Minimum peak rate; in a slower rotation, bias and misalignment dominate the velocity.
+        Minimum peak rate, for half turns of up to 5.6 s; in a slower rotation, bias and misalignment dominate
+        the velocity.
     axis_tilt_deg : float
         Maximum angle between the axis and the vertical.
     rest_before_s, rest_after_s : float
@@ -34,7 +35,7 @@ class RotationLimits:
 
     angle_deg: float = 180.0
     angle_tolerance_deg: float = 5.0
-    least_peak_deg_per_s: float = 70.0
+    least_peak_deg_per_s: float = 60.0
     axis_tilt_deg: float = 10.0
     rest_before_s: float = 32.0
     rest_after_s: float = 2.8

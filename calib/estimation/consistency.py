@@ -10,7 +10,9 @@ With a free step of velocity at every turn the arms have no effect on the fit. T
 The prior of an error of the calibration is an equation for a parameter: it adds no degree of freedom. The
 priors of the parameters of the runs are bounds, far wider than what they allow for, so that each such
 parameter takes a degree of freedom as far as the data determine it. The noise itself is an estimate with f
-degrees of freedom, so that the scatter follows an F distribution.
+degrees of freedom. Near a turn the readings' own errors, which are known, exceed the random walk. Where only
+a share w of the scatter is due to the walk, an error of the noise changes the scatter by w times as much: it
+follows an F distribution with f / w^2 degrees of freedom of the noise.
 
 **Each turn against the others.** Freeing the step of one turn takes it out. The arms shift by the difference
 of the estimates, whose covariance is the difference of their covariances, and chi-square falls by a value
@@ -60,7 +62,7 @@ def scatter_and_redundancy(
     """
     if in_motion:
         freedom = system.count - basis.shape[1] - _determined(system, covariance)
-        return None, ChiSquare(system.chi_square(x), freedom, noise.degrees_of_freedom)
+        return None, ChiSquare(system.chi_square(x), freedom, _of_noise(system, x, noise))
     free, spread = system.solve(_NO_ARMS, system.turns)
     scatter = system.chi_square(free)
     all_turns = sum(len(part.accepted) for part in system.parts)
@@ -68,9 +70,14 @@ def scatter_and_redundancy(
     freedom = system.count - 2 * all_turns - _determined(system, spread)
     return (
         # level accelerometers that send hardly a pulse are read at the ends of the rests alone
-        ChiSquare(scatter, freedom, noise.degrees_of_freedom) if freedom > 0 else None,
+        ChiSquare(scatter, freedom, _of_noise(system, free, noise)) if freedom > 0 else None,
         ChiSquare(system.chi_square(x) - scatter if redundant else 0.0, redundant),
     )
+
+
+def _of_noise(system: NormalEquations, x: Array, noise: SensorNoise) -> int:
+    """Return the degrees of freedom of the noise as far as chi-square depends on it."""
+    return round(noise.degrees_of_freedom / max(system.walk_share(x), 1e-3) ** 2)
 
 
 def _determined(system: NormalEquations, covariance: Array) -> int:

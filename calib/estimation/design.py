@@ -204,14 +204,15 @@ def _skew_column(run: Run, C: Array, dt: Array) -> Array:
 
         integral of C_nb df_b = f_n(t) - f_n(0) - integral of dC_nb f_b
 
-    with the specific force as navigated. At rest the first two cancel. In motion f_n is the mean of the
-    adjacent rows, because a row's own noise is also in its velocity.
+    with the specific force as navigated. At rest the first two cancel. Next to a turn their difference is the
+    acceleration between the means over a row before and after: a vibration of the case, such as its reaction
+    to the dither, is neither in the readings, which are means, too, nor may it determine the skew.
     """
     C_nb = Attitude.from_quat(np.roll(run.rows["q_nb"], -1, axis=1)).as_matrix()
     f_n = _acceleration(run, dt, np.zeros((len(dt), 3))) + np.array([0.0, 0.0, run.gravity])
     f_b = np.einsum("nji,nj->ni", C, f_n)
     moving = ~run.at_rest
     column = -np.cumsum(np.einsum("nij,nj->ni", np.diff(C_nb, axis=0, prepend=C_nb[:1]), f_b), axis=0)
-    later = np.concatenate([f_n[1:], f_n[-1:]])
-    column[moving] += 0.5 * (f_n + later)[moving] - [0.0, 0.0, run.gravity]
+    of_means = np.diff(run.v_n, axis=0, append=run.v_n[-1:]) / dt[:, None]
+    column[moving] += of_means[moving]
     return np.asarray(column[:, :, None], np.float64)

@@ -90,6 +90,7 @@ class RunEquations(NamedTuple):
     """Whitened equations of a run, `v = A @ (R, shared, own, steps)`."""
 
     L: Array  # (n, n), Cholesky factor of the covariance of the noise
+    walk: Array  # (n, n), part of that covariance by the random walk of velocity
     A: Array
     v: Array  # (n,)
     accepted: tuple[bool, ...]  # of each turn
@@ -145,11 +146,12 @@ def run_equations(run: Run, noise: SensorNoise, pivot: str, design: Design) -> R
     if pivot == "fixed":
         readings, of_motion = _with_motion(readings, run, design)
         A = np.concatenate([A, of_motion])
-    K = sum(noise_sources(readings, noise, run.gravity).values())
-    L = np.asarray(np.linalg.cholesky(K), np.float64)
+    sources = noise_sources(readings, noise, run.gravity)
+    L = np.asarray(np.linalg.cholesky(sum(sources.values())), np.float64)
     white = solve_triangular(L, np.column_stack([A, readings.v]), lower=True)
     accepted = tuple(turn.accepted for turn in run.turns)
-    return RunEquations(L, white[:, :-1], white[:, -1], accepted, readings)
+    walk = sources["velocity_walk"]
+    return RunEquations(L, walk, white[:, :-1], white[:, -1], accepted, readings)
 
 
 def noise_sources(readings: Readings, noise: SensorNoise, gravity: float) -> dict[str, Array]:
@@ -275,6 +277,15 @@ class NormalEquations:
     def chi_square(self, x: Array) -> float:
         """Return chi-square of the residuals and the priors."""
         return float(self._yy - 2.0 * self.b @ x + x @ self.N @ x)
+
+    def walk_share(self, x: Array) -> float:
+        """Return the share of the random walk of velocity in chi-square, -d ln(chi-square) / d ln(q_v^2)."""
+        total = 0.0
+        for k, part in enumerate(self.parts):
+            residual = part.v - part.A @ x[self.columns_of(k)]
+            z = solve_triangular(part.L, residual, lower=True, trans="T")
+            total += float(z @ part.walk @ z)
+        return total / self.chi_square(x)
 
     def with_pivots(self, sigma: float) -> "NormalEquations":
         """Return the equations with a shift of the origin of b in each run, 1-sigma in m."""

@@ -122,8 +122,8 @@ def _plain_covariance(runs: Sequence[Run], noise: SensorNoise, priors: Priors) -
         row[:, :, system.columns_of(k)] = means[1::2] - means[::2]
         rows.append(row.reshape(-1, len(system.b))[:, 9:cut])
         t = np.array([run.t_s[at].mean() for _, at in windows])
-        velocity, tilt = walk_covariances(t, np.tile([1.0, 0.0, 0.0], (len(t), 1)), noise, run.gravity)
-        K = velocity + tilt
+        walk, tilt = walk_covariances(t, np.tile([1.0, 0.0, 0.0], (len(t), 1)), noise, run.gravity)
+        K = walk + tilt
         gains = K[1::2, 1::2] - K[1::2, ::2] - K[::2, 1::2] + K[::2, ::2]
         pulses = np.kron(np.eye(len(turns)), 2.0 * run.readings.turn[:2, :2])
         blocks.append(np.kron(gains, np.eye(2)) + pulses)

@@ -6,9 +6,19 @@ of a turn, the end of the rest is read, too: the pulses of the turn determine it
 
 Where the three sensing axes are not one vertical and two level ones, all three accelerometers sense gravity
 and send pulses in nearly every sample: the velocities east and north are then read as if not quantised.
+
+**In a turn** an error e of the sum of an axis is turned into other axes and leaves the integral of w e, with
+the rate w. Where the case vibrates, as in reaction to the dither, pulses come and go with it: e is another
+fraction of a pulse in each sample, of variance p^2 / 12. Samples of length tau leave
+
+    variance = p^2 / 12 tau integral of w^2 dt = p^2 / 12 tau (10 / 7) pi^2 / T
+
+after half a turn of least jerk in T, whatever the amplitude. A single velocity next to a turn is off by the
+vibration itself.
 """
 
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -30,9 +40,6 @@ EDGE_SHARE: Final = 0.05
 
 TURN_SHARE: Final = 0.008
 """What the motion between two pulses is off by in a turn, in pulses: turned into other axes, it stays."""
-
-SHAKEN_SHARE: Final = 0.12
-"""The same, in the rms of what vibrates beyond the pulses: they come and go with it."""
 
 LEAST_VARIANCE: Final = (2e-6) ** 2
 """Smallest variance of a reading, (m/s)^2, for the effects that the model neglects."""
@@ -89,20 +96,21 @@ def read_rests(rests: Sequence[RestSamples], A: Array, pulse: Array, walk: float
     -------
     Readings
     """
-    parts = []
+    first, parts = rests[0], []
+    swing = np.array([vibration(first.t_s, dv) for dv in first.dv_a.T])
+    shaken = np.maximum(swing - pulse**2 / 12.0, 0.0) * (pulse > 0.0)
+    edge = (EDGE_SHARE * pulse) ** 2 + shaken
     for k, rest in enumerate(rests):
         after, before = k > 0, k + 1 < len(rests)
         grid = _grid(rest.t_s, after_a_turn=after, before_a_turn=before)
-        for direction_n, v, found, p in _channels(rest, A, pulse, walk):
+        for direction_n, v, found, of_one in _channels(rest, A, pulse, walk, edge):
             read = found.take(found.nearest(*grid))
-            read = read.joined(_next_to_turns(rest, v, read.t_s, p, after=after, before=before))
+            read = read.joined(_next_to_turns(rest, v, read.t_s, of_one, after=after, before=before))
             parts.append((np.full(len(read.t_s), k), np.tile(direction_n, (len(read.t_s), 1)), *read))
     arrest, direction_n, t_s, v, variance = map(np.concatenate, zip(*parts, strict=True))
-    first = rests[0]
-    swing = np.array([vibration(first.t_s, dv) for dv in first.dv_a.T]) * (pulse > 0.0)
-    start = np.maximum(pulse**2 / 12.0, swing)
-    turn = (TURN_SHARE * pulse) ** 2 + SHAKEN_SHARE**2 * (start - pulse**2 / 12.0)
     M = first.C_nb @ np.linalg.inv(A)
+    start = pulse**2 / 12.0 + shaken
+    turn = (TURN_SHARE * pulse) ** 2 + np.minimum(shaken, pulse**2 / 12.0) * _squared_rate(rests)
     least = np.maximum(variance, LEAST_VARIANCE)
     return Readings(t_s, arrest, direction_n, v, least, M * start @ M.T, M * turn @ M.T)
 
@@ -124,29 +132,36 @@ def level_channels(up_a: Array) -> list[int]:
 
 
 def _channels(
-    rest: RestSamples, A: Array, pulse: Array, walk: float
+    rest: RestSamples, A: Array, pulse: Array, walk: float, edge: Array
 ) -> Iterator[tuple[Array, Array, Channel, float]]:
-    """Yield direction, velocity, readings and pulse of each channel.
+    """Yield direction, velocity and readings of each channel, and the variance of a single velocity.
 
     The channels are the level accelerometers, or east and north.
     """
     axes_n = A @ rest.C_nb.T
     level = level_channels(axes_n[:, 2])
     if len(level) != 2:
-        axes_n, level, pulse = np.eye(3), [0, 1], np.zeros(3)
+        axes_n, level, pulse, edge = np.eye(3), [0, 1], np.zeros(3), np.zeros(3)
     axes_n[:, 2] = 0.0  # the vertical velocity has the error of gravity
     for i in level:
-        v, p = rest.v_n @ axes_n[i], float(pulse[i])
-        yield axes_n[i], v, channel(rest.t_s, v, rest.dv_a[:, i], p, walk), p
+        v = rest.v_n @ axes_n[i]
+        yield axes_n[i], v, channel(rest.t_s, v, rest.dv_a[:, i], float(pulse[i]), walk), float(edge[i])
 
 
 def _next_to_turns(
-    rest: RestSamples, v: Array, read_s: Array, pulse: float, *, after: bool, before: bool
+    rest: RestSamples, v: Array, read_s: Array, variance: float, *, after: bool, before: bool
 ) -> Channel:
     """Return readings at the ends of a rest that are next to a turn, where there is no other one near."""
     ends = [0] * after + [-1] * before
     at = [k for k in ends if not (np.abs(read_s - rest.t_s[k]) < SPACING_S).any()]
-    return Channel(rest.t_s[at], v[at], np.full(len(at), (EDGE_SHARE * pulse) ** 2))
+    return Channel(rest.t_s[at], v[at], np.full(len(at), variance))
+
+
+def _squared_rate(rests: Sequence[RestSamples]) -> float:
+    """Return the integral of the squared rate over a turn times the sample interval, mean of all turns."""
+    tau = rests[0].t_s[1] - rests[0].t_s[0]
+    turn_s = np.array([after.t_s[0] - before.t_s[-1] for before, after in pairwise(rests)])
+    return float(np.mean(10.0 / 7.0 * np.pi**2 / turn_s) * tau)
 
 
 def _grid(t_s: Array, *, after_a_turn: bool, before_a_turn: bool) -> tuple[Array, Array]:

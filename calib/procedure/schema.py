@@ -56,7 +56,7 @@ class ProcedureLimits(Model):
     noise_deg_per_s: Annotated[float, Key(gt=0, le=1)] = 0.1
     noise_mg: Annotated[float, Key(gt=0, le=50)] = 5.0
     angle_tolerance_deg: Annotated[float, Key(gt=0, le=20)] = 5.0
-    least_peak_deg_per_s: Annotated[float, Key(gt=0, le=1000)] = 70.0
+    least_peak_deg_per_s: Annotated[float, Key(gt=0, le=1000)] = 60.0
     axis_tilt_deg: Annotated[float, Key(gt=0, le=20)] = 10.0
 
 

@@ -166,7 +166,7 @@ def test_results_are_short_in_a_notebook(result: IdentificationResult, site: Sit
         assert html.count("<tr>") == (3 if shown is prediction else 4)
     assert repr(result).startswith("<IdentificationResult: unit nominal, method joint, 3 rotations, rank 6, ")
     assert repr(result).endswith("mm: usable for a certificate>")
-    assert "r_x (+2" in repr(result.arms)
+    assert f"r_x ({result.arms.r_b[0, 0] / MM:+.3f}, " in repr(result.arms)
     assert "±" not in calib.LeverArms(result.arms.r_b, None, "given")._repr_html_()
 
 

@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from calib.detection.acceptance import RotationLimits
+from calib.estimation.design import Design
 from calib.estimation.joint import estimate_joint
+from calib.estimation.linear_system import NormalEquations, extra_terms, prior_parameters, run_equations
 from calib.estimation.noise import SensorNoise
 from calib.estimation.plain import estimate_plain
 from calib.estimation.predict import PlannedRotation, predict
@@ -18,6 +20,7 @@ from calib.estimation.priors import Priors
 from calib.estimation.result import CENTROID_BASIS, TO_DIFFERENCES, LeverArmEstimate
 from calib.estimation.runs import NavigationOptions, Run, navigate_capture, navigate_rotations
 from calib.validation import montecarlo
+from calib.validation.bound import sigma_over_bound
 from calib.validation.montecarlo import Budget
 from imudrv import profiles
 from imudrv.calibration import read_calibration
@@ -282,6 +285,35 @@ def test_a_shaking_that_the_filter_passes_is_refused(simulated: tuple[list[Run],
     assert refusal.startswith("the gyro increments carry dither or vibration (3 arcsec at 141 Hz about X, ")
     assert 0.1 < found.dither_error < 0.5
     assert estimate_plain(runs).refusals == ()  # its sigma is forty times as large
+
+
+def test_the_stated_covariance_is_that_of_the_best_estimate(simulated: tuple[list[Run], Array]) -> None:
+    runs, _ = simulated
+    known = Priors(skew=0.0)  # a velocity without error next to a turn would show the skew, too
+    assert 1.0 <= sigma_over_bound(estimate_joint(runs, known), runs, known) < 1.03  # the requirement
+
+
+def test_the_scatter_depends_on_the_walk_as_far_as_its_band_allows_for(
+    simulated: tuple[list[Run], Array],
+) -> None:
+    runs, _ = simulated
+    found, terms = estimate_joint(runs), extra_terms(Priors(), ())
+    parameters = prior_parameters(runs, Priors(), terms)
+
+    def scatter(walk: float) -> tuple[float, float]:
+        noise = replace(found.noise, velocity_walk=walk)
+        equations = [run_equations(run, noise, "free", Design(run, terms)) for run in runs]
+        system = NormalEquations(equations, parameters)
+        x, _ = system.solve(np.zeros((9, 0)), system.turns)
+        return system.chi_square(x), system.walk_share(x)
+
+    walk = found.noise.velocity_walk
+    (low, _), (_, share), (high, _) = (scatter(factor * walk) for factor in (0.999, 1.0, 1.001))
+    assert share == pytest.approx(np.log(low / high) / (2.0 * np.log(1.001 / 0.999)), rel=1e-3)
+    assert 0.5 < share < 0.9  # readings have errors of their own, which are known
+    assert found.scatter is not None
+    noise_freedom = found.scatter.noise_degrees_of_freedom
+    assert noise_freedom == pytest.approx(found.noise.degrees_of_freedom / share**2, rel=0.01)
 
 
 # --- before any data ---
