@@ -2,7 +2,7 @@
 
 tools/run python tools/montecarlo.py --cases 200 --skew-sigma-ms 0
 tools/run python tools/montecarlo.py --budget coarse-pulses --signs both --cases 20
-tools/run python tools/montecarlo.py --search 100
+tools/run python tools/montecarlo.py --search 100 --workers 2
 
 Seeds below 1000 were used to tune the estimate; reports begin at 1000.
 """
@@ -10,18 +10,21 @@ Seeds below 1000 were used to tune the estimate; reports begin at 1000.
 import argparse
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from calib.cli.arguments import add_workers
 from calib.detection.acceptance import RotationLimits
 from calib.estimation.joint import estimate_joint
 from calib.estimation.priors import Priors
 from calib.estimation.result import LeverArmEstimate
+from calib.fleet.spread import spread
 from calib.identification import CaptureSummary, IdentificationResult, PriorCalibration
 from calib.messages import english
 from calib.reports.verdict import verdict
@@ -78,10 +81,9 @@ def outcome(seed: int, budget: Budget) -> Outcome:
     return Outcome(overall.level, english(worst.text), estimate, truth)
 
 
-def search(seeds: Iterable[int]) -> Iterator[tuple[int, Outcome]]:
-    """Yield the outcome of conditions drawn at random."""
-    for seed in seeds:
-        yield seed, outcome(seed, drawn(seed))
+def drawn_outcome(seed: int) -> Outcome:
+    """Identify a unit in conditions drawn at random."""
+    return outcome(seed, drawn(seed))
 
 
 def main() -> None:
@@ -101,21 +103,28 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
     text = "instead: N cases with conditions drawn at random, and the worst errors among them"
     parser.add_argument("--search", type=int, metavar="N", help=text)
+    add_workers(parser)
     options = parser.parse_args()
     if options.cases < 1 or (options.search is not None and options.search < 1):
         parser.error("--cases, --search: expected 1 or more")
     if not 0.0 <= options.skew_sigma_ms <= 2.0:
         parser.error("--skew-sigma-ms: expected 0 to 2")
     seeds = range(options.seed, options.seed + (options.search or options.cases))
-    shown: Iterable[int] = seeds if options.json else track(seeds, description="cases", transient=True)
+
+    def outcomes(function: Callable[[int], Outcome]) -> list[Outcome]:
+        found: Iterable[Outcome] = spread(function, seeds, options.workers, options.scheduler)
+        if not options.json:
+            found = track(found, description="cases", total=len(seeds), transient=True)
+        return list(found)
+
     if options.search:
-        _print_search(list(search(shown)))
+        _print_search(list(zip(seeds, outcomes(drawn_outcome), strict=True)))
         return
     budget = BUDGETS[options.budget]
     budget = replace(budget, priors=replace(budget.priors, skew=options.skew_sigma_ms * 1e-3))
     if options.signs:
         budget = replace(budget, signs=(1,) if options.signs == "one" else (1, -1))
-    _print_statistics(options, budget, [outcome(seed, budget) for seed in shown])
+    _print_statistics(options, budget, outcomes(partial(outcome, budget=budget)))
 
 
 def _print_statistics(options: Any, budget: Budget, found: list[Outcome]) -> None:
