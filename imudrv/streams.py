@@ -1,32 +1,54 @@
-"""Datagrams over Zenoh (https://zenoh.io), for many benches: found by name, over TLS and routers if asked.
+"""Samples, status and events over Zenoh (https://zenoh.io), for many benches.
+
+A unit has three keys: ``KEY`` for the datagrams, ``KEY/status`` and ``KEY/events`` for JSON documents.
+Sessions listen on the loopback and find those of this computer; a configuration file of Zenoh connects
+others.
 
 Between Zenoh's threads and ours is a pair of sockets, so that the live loop sends to a descriptor as to any
 other output, and a receiver reads one.
 """
 
+import json
 import socket
+import time
 from collections import deque
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from threading import Thread
-from typing import Any, Final
+from threading import Event, Lock, Thread
+from typing import Any, Final, NamedTuple
 
 from imudrv.errors import InputError
+from imudrv.loopback import LOOPBACK
 from imudrv.url import Url
 from imudrv.wire.datagram import SIZE
+
+STATUS: Final = "status"
+EVENTS: Final = "events"
+"""Last part of the keys beside that of the datagrams."""
 
 _AT_ONCE: Final = SIZE << 9
 _BUFFER: Final = 1 << 22
 _JOIN_S: Final = 1.0
-_MOST_ARRIVED: Final = 1 << 18  # of all units: five seconds of 50 at 1 kHz
+_COLLECT_S: Final = 0.005
+"""Time for which samples are collected: a message for each would wake this thread in the middle of the loop,
+and take a subscriber of 50 units two processors."""
+_MOST_NOTES: Final = 100
+_LONGEST: Final = 1 << 20
+"""Most bytes of one message that a subscriber takes; the longest of ours is a status of some kilobytes."""
+_MOST_BYTES: Final = 1 << 25
+"""Most bytes that wait in a `Watch`: of 50 units at 1 kHz those of two seconds at least."""
+_OVERHEAD: Final = 256
+"""Bytes of a message that waits, beside its data."""
 
 
 class Publication:
-    """A key that datagrams are published under; write them to `socket`, and close that to end.
+    """The keys that one unit is published under; write datagrams to `socket`, and close that to end.
 
     Parameters
     ----------
     url : Url
-        ``zenoh://KEY``; option ``config``: a configuration file of Zenoh.
+        ``zenoh://KEY``; option ``config``: a configuration file of Zenoh, which alone then says where the
+        session listens and connects.
 
     Attributes
     ----------
@@ -43,25 +65,55 @@ class Publication:
         zenoh = _zenoh(url)
         _require_one(url)
         self._session = _session(zenoh, url)
+        self._error = zenoh.ZError
+        block = zenoh.CongestionControl.BLOCK
+        # A status that a congested subscriber does not get is followed by another one.
+        kinds = {"": block, STATUS: zenoh.CongestionControl.DROP, EVENTS: block}
         try:
-            self._publisher = self._session.declare_publisher(
-                url.address,
-                congestion_control=zenoh.CongestionControl.BLOCK,
-                reliability=zenoh.Reliability.RELIABLE,
-                express=True,
-            )
+            self._publishers = {
+                kind: self._session.declare_publisher(
+                    f"{url.address}/{kind}".rstrip("/"),
+                    encoding=zenoh.Encoding.APPLICATION_JSON if kind else zenoh.Encoding.ZENOH_BYTES,
+                    congestion_control=congestion_control,
+                    reliability=zenoh.Reliability.RELIABLE,
+                    express=True,
+                )
+                for kind, congestion_control in kinds.items()
+            }
         except zenoh.ZError as error:
             self._session.close()
             raise InputError(f"{url.text}: expected a key such as imu50/BENCH/UNIT: {error}") from error
         self.socket, self._far = _pair()
         self.socket.setblocking(False)
-        self._thread = Thread(target=self._run, name=f"publisher of {url.address}", daemon=True)
-        self._thread.start()
+        self._notes: deque[tuple[str, Callable[[], Mapping[str, object]]]] = deque(maxlen=_MOST_NOTES)
+        self._is_noted, self._is_closing = Event(), False
+        self._threads = [
+            Thread(target=run, name=f"publisher of {url.address}", daemon=True)
+            for run in (self._run, self._run_notes)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def note(self, kind: str, document: Callable[[], Mapping[str, object]]) -> None:
+        """Publish a document; of many that wait, the oldest are dropped.
+
+        Parameters
+        ----------
+        kind : str
+            `STATUS` or `EVENTS`.
+        document : callable
+            Returns values that JSON can represent; called in the publishing thread.
+        """
+        self._notes.append((kind, document))
+        self._is_noted.set()
 
     def close(self) -> None:
-        """Publish what was written, for at most a second, and close."""
+        """Publish what was written and noted, for at most a second each, and close."""
         self.socket.close()
-        self._thread.join(_JOIN_S)
+        self._is_closing = True
+        self._is_noted.set()
+        for thread in self._threads:
+            thread.join(_JOIN_S)
         self._session.close()
 
     def _run(self) -> None:
@@ -70,9 +122,29 @@ class Publication:
             while data := self._far.recv(_AT_ONCE):
                 data = rest + data
                 whole = len(data) // SIZE * SIZE
-                if whole:
-                    self._publisher.put(data[:whole])
+                if whole and not self._put("", data[:whole]):
+                    return
                 rest = data[whole:]
+                time.sleep(_COLLECT_S)
+
+    def _run_notes(self) -> None:
+        is_last = False
+        while not is_last:
+            self._is_noted.wait()
+            self._is_noted.clear()
+            is_last = self._is_closing
+            while self._notes:
+                kind, document = self._notes.popleft()
+                if not self._put(kind, json.dumps(document(), default=str).encode()):
+                    return
+
+    def _put(self, kind: str, data: bytes) -> bool:
+        """Publish; return whether the session is open still."""
+        try:
+            self._publishers[kind].put(data)
+        except self._error:
+            return False
+        return True
 
 
 class Subscription:
@@ -110,14 +182,44 @@ class Subscription:
         self._session.close()
 
     def _take(self, sample: Any) -> None:
+        if len(sample.payload) > _LONGEST:
+            return
         try:
             self._far.sendall(sample.payload.to_bytes())
         except OSError:
             return  # closed
 
 
+class Heard(NamedTuple):
+    """A message of a unit.
+
+    Attributes
+    ----------
+    unit : str
+        Key of the unit.
+    kind : str
+        `STATUS` or `EVENTS`; empty: datagrams.
+    data : bytes
+        From whoever publishes there: not checked.
+    """
+
+    unit: str
+    kind: str
+    data: bytes
+
+    def document(self) -> dict[str, Any]:
+        """Return the JSON document; empty if it is none."""
+        try:
+            document = json.loads(self.data)
+        except (ValueError, RecursionError):
+            return {}
+        return document if isinstance(document, dict) else {}
+
+
 class Watch:
-    """The datagrams of all units whose keys match, such as ``imu50/**``.
+    """Everything that is published under a key and below it: samples, status and events of all units there.
+
+    What waits is bounded: of more, the oldest is dropped.
 
     Parameters
     ----------
@@ -128,28 +230,43 @@ class Watch:
     def __init__(self, url: Url) -> None:
         zenoh = _zenoh(url)
         self._session = _session(zenoh, url)
-        self._arrived: deque[tuple[str, bytes]] = deque(maxlen=_MOST_ARRIVED)
+        self._arrived: deque[Heard] = deque()
+        self._size, self._lock = 0, Lock()
         try:
-            self._subscriber = self._session.declare_subscriber(url.address, self._take)
+            below = f"{url.address.removesuffix('/**')}/**"
+            self._subscriber = self._session.declare_subscriber(below, self._take)
         except zenoh.ZError as error:
             self._session.close()
             raise InputError(f"{url.text}: expected a key such as imu50/**: {error}") from error
 
-    def take(self) -> list[tuple[str, bytes]]:
-        """Return key and datagrams of what has arrived since the last call."""
-        return [self._arrived.popleft() for _ in range(len(self._arrived))]
+    def take(self) -> list[Heard]:
+        """Return what has arrived since the last call."""
+        with self._lock:
+            arrived, self._arrived, self._size = self._arrived, deque(), 0
+        return list(arrived)
 
     def close(self) -> None:
         """Leave."""
         self._session.close()
 
     def _take(self, sample: Any) -> None:
-        self._arrived.append((str(sample.key_expr), sample.payload.to_bytes()))
+        if len(sample.payload) > _LONGEST:
+            return
+        key, data = str(sample.key_expr), sample.payload.to_bytes()
+        unit, _, kind = key.rpartition("/")
+        heard = Heard(unit, kind, data) if kind in (STATUS, EVENTS) else Heard(key, "", data)
+        with self._lock:
+            self._arrived.append(heard)
+            self._size += len(data) + _OVERHEAD
+            while self._size > _MOST_BYTES:
+                self._size -= len(self._arrived.popleft().data) + _OVERHEAD
 
 
 def _require_one(url: Url) -> None:
     if "*" in url.address:
         raise InputError(f"{url.text}: expected the key of one unit, got one for several")
+    if url.address.rpartition("/")[2] in (STATUS, EVENTS):
+        raise InputError(f"{url.text}: expected the key of a unit, got that of its status or events")
 
 
 def _pair() -> tuple[socket.socket, socket.socket]:
@@ -166,9 +283,18 @@ def _session(zenoh: Any, url: Url) -> Any:
     if path is not None and not Path(path).is_file():
         raise InputError(f"{url.text}: config: expected a file, there is none; check the path")
     try:
-        return zenoh.open(zenoh.Config() if path is None else zenoh.Config.from_file(path))
+        return zenoh.open(_on_this_computer(zenoh) if path is None else zenoh.Config.from_file(path))
     except zenoh.ZError as error:
         raise InputError(f"{url.text}: cannot be opened: {error}") from error
+
+
+def _on_this_computer(zenoh: Any) -> Any:
+    """Return the configuration of a session that listens, and looks for others, on the loopback only."""
+    config = zenoh.Config()
+    config.insert_json5("mode", json.dumps("peer"))
+    config.insert_json5("listen/endpoints", json.dumps([f"tcp/{LOOPBACK}:0"]))
+    config.insert_json5("scouting/multicast/interface", json.dumps(LOOPBACK))
+    return config
 
 
 def _zenoh(url: Url) -> Any:

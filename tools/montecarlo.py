@@ -3,7 +3,7 @@
 tools/run python tools/montecarlo.py --cases 200 --skew-sigma-ms 0
 tools/run python tools/montecarlo.py --budget coarse-pulses --signs both --cases 20
 tools/run python tools/montecarlo.py --budget ten-turns --cases 10 --skew-sigma-ms 0 --bound
-tools/run python tools/montecarlo.py --search 100
+tools/run python tools/montecarlo.py --search 100 --workers 2
 
 Seeds below 1000 were used to tune the estimate; reports begin at 1000.
 """
@@ -11,8 +11,9 @@ Seeds below 1000 were used to tune the estimate; reports begin at 1000.
 import argparse
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,10 +21,12 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from calib.cli.arguments import add_workers
 from calib.detection.acceptance import RotationLimits
 from calib.estimation.joint import estimate_joint
 from calib.estimation.priors import Priors
 from calib.estimation.result import LeverArmEstimate
+from calib.fleet.spread import spread
 from calib.identification import CaptureSummary, IdentificationResult, PriorCalibration
 from calib.messages import english
 from calib.reports.verdict import verdict
@@ -84,10 +87,9 @@ def outcome(seed: int, budget: Budget, *, bound: bool = False) -> Outcome:
     return Outcome(overall.level, english(worst.text), estimate, truth, over_bound)
 
 
-def search(seeds: Iterable[int]) -> Iterator[tuple[int, Outcome]]:
-    """Yield the outcome of conditions drawn at random."""
-    for seed in seeds:
-        yield seed, outcome(seed, drawn(seed))
+def drawn_outcome(seed: int) -> Outcome:
+    """Identify a unit in conditions drawn at random."""
+    return outcome(seed, drawn(seed))
 
 
 def main() -> None:
@@ -109,21 +111,28 @@ def main() -> None:
     parser.add_argument("--bound", action="store_true", help=text)
     text = "instead: N cases with conditions drawn at random, and the worst errors among them"
     parser.add_argument("--search", type=int, metavar="N", help=text)
+    add_workers(parser)
     options = parser.parse_args()
     if options.cases < 1 or (options.search is not None and options.search < 1):
         parser.error("--cases, --search: expected 1 or more")
     if not 0.0 <= options.skew_sigma_ms <= 2.0:
         parser.error("--skew-sigma-ms: expected 0 to 2")
     seeds = range(options.seed, options.seed + (options.search or options.cases))
-    shown: Iterable[int] = seeds if options.json else track(seeds, description="cases", transient=True)
+
+    def outcomes(function: Callable[[int], Outcome]) -> list[Outcome]:
+        found: Iterable[Outcome] = spread(function, seeds, options.workers, options.scheduler)
+        if not options.json:
+            found = track(found, description="cases", total=len(seeds), transient=True)
+        return list(found)
+
     if options.search:
-        _print_search(list(search(shown)))
+        _print_search(list(zip(seeds, outcomes(drawn_outcome), strict=True)))
         return
     budget = BUDGETS[options.budget]
     budget = replace(budget, priors=replace(budget.priors, skew=options.skew_sigma_ms * 1e-3))
     if options.signs:
         budget = replace(budget, signs=(1,) if options.signs == "one" else (1, -1))
-    _print_statistics(options, budget, [outcome(seed, budget, bound=options.bound) for seed in shown])
+    _print_statistics(options, budget, outcomes(partial(outcome, budget=budget, bound=options.bound)))
 
 
 def _print_statistics(options: Any, budget: Budget, found: list[Outcome]) -> None:

@@ -27,6 +27,17 @@ def add_channel(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--channel", metavar="NAME", help="channel of CAN logs, such as can0")
 
 
+def add_workers(parser: argparse.ArgumentParser) -> None:
+    """Add ``--workers`` and ``--scheduler``, of which one may be given, see `calib.fleet.spread`."""
+    where = parser.add_mutually_exclusive_group()
+    text = "processes on this computer (default: 1; more need pip install imu50[dask])"
+    where.add_argument("--workers", type=int, default=1, metavar="N", help=text)
+    text = (
+        "Dask scheduler whose workers do it, such as tcp://host:8786; with the same software and paths"
+    )
+    where.add_argument("--scheduler", metavar="URL", help=text)
+
+
 def add_certificate_output(parser: argparse.ArgumentParser) -> None:
     """Add ``-o``, required."""
     text = "certificate to write"

@@ -1,29 +1,32 @@
 """Command `calib validate`."""
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Sequence
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Final
 
 from calib.api import validate
 from calib.certificate import lever_arms_of
-from calib.cli.arguments import add_channel, check_output
+from calib.cli.arguments import add_channel, add_workers, check_output
+from calib.fleet.spread import spread
 from calib.reports.html import as_html
 from calib.reports.text import print_document
 from calib.reports.validation import document
 from calib.validation.simulate import TRIALS, campaign, dither_trials, skew_trials
-from calib.validation.trial import RATE_FILTER, Trial
+from calib.validation.trial import RATE_FILTER
 from calib.validation.verdict import Validation, evaluate
 from imudrv.calibration import Calibration, read_calibration
 from imudrv.cli.arguments import add_profile
 from imudrv.errors import InputError
 from imudrv.files.atomic import atomic_write
 from imudrv.files.inputs import total_size
-from imudrv.imu.rate_filter import NAMES
+from imudrv.imu.rate_filter import NAMES, RateFilterName
 from imudrv.nav.alignment import ALIGNMENT_S
 from imudrv.terminal import NOT_GOOD, OK, console, progress
 
+_MORE: Final = {"skew": skew_trials, "dither": dither_trials}
 EXAMPLE: Final = "--simulate rocking --seeds 20 --report validation.html"
 
 
@@ -35,6 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = "simulate units, with lever arms from a simulated procedure"
     add("--simulate", choices=(*TRIALS, "all"), help=text)
     add("--seeds", type=int, default=1, metavar="N", help="number of simulated units (default: 1)")
+    add_workers(parser)
     add_profile(parser)
     add_channel(parser)
     add("--calibration", type=Path, metavar="C.yaml", help="calibration of the unit, with lever arms")
@@ -56,7 +60,7 @@ def run(arguments: argparse.Namespace) -> int:
         inputs = (*arguments.recordings, arguments.profile, arguments.calibration, arguments.site)
         check_output(arguments.report, *inputs)
     if arguments.simulate is not None:
-        validations = [evaluate(trial) for trial in _simulated(arguments)]
+        validations = _simulated(arguments)
         drawn = sum(one.trial.name.endswith("unit 1") for one in validations)
         report = document("a simulated unit", validations, drawn)
         required = [one for one in validations if "unit" in one.trial.name]
@@ -70,17 +74,28 @@ def run(arguments: argparse.Namespace) -> int:
     return OK if all(one.good for one in required) else NOT_GOOD
 
 
-def _simulated(arguments: argparse.Namespace) -> Iterator[Trial]:
-    which, seeds, name = arguments.simulate, arguments.seeds, arguments.rate_filter
+def _simulated(arguments: argparse.Namespace) -> list[Validation]:
+    which, seeds = arguments.simulate, arguments.seeds
     if seeds < 1:
         raise InputError(f"--seeds: expected 1 or more, got {seeds}")
-    screen = console(stderr=True)
     names = tuple(TRIALS) if which == "all" else (which,)
+    function = partial(_validations, names=names, rate_filter=arguments.rate_filter)
+    work = [*range(1, seeds + 1), *(_MORE if which == "all" else ())]
+    found: list[Validation] = []
+    screen = console(stderr=True)
     with screen.status("simulate") if screen.is_terminal else nullcontext() as status:
-        yield from campaign(names, range(1, seeds + 1), name, status.update if status else lambda _: None)
-        if which == "all":
-            yield from skew_trials(1)
-            yield from dither_trials(1)
+        for part in spread(function, work, arguments.workers, arguments.scheduler):
+            found += part
+            if status:
+                status.update(f"simulate: {len(found)} trials done")
+    return found
+
+
+def _validations(work: int | str, names: Sequence[str], rate_filter: RateFilterName) -> list[Validation]:
+    """Return the trials of a unit, by its seed, or those of a kind of `_MORE`."""
+    if isinstance(work, str):
+        return [evaluate(trial) for trial in _MORE[work](1)]
+    return [evaluate(trial) for trial in campaign(names, [work], rate_filter)]
 
 
 def _navigated(arguments: argparse.Namespace) -> tuple[Calibration, list[Validation]]:

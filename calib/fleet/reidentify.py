@@ -1,14 +1,12 @@
 """Identify the sessions of a tree again, on several cores or computers, and compare with what was certified.
 
 After a change of the software or of its priors, this says for which units the result would be another one.
-The sessions are not changed. The work is spread by Dask (`dask.distributed`), whose scheduler gives the
-session of a worker that dies to another one; without it everything runs here, with the same bits.
+The sessions are not changed.
 """
 
-import logging
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,6 +14,7 @@ from calib.bench import journal
 from calib.bench.result import identify_session
 from calib.bench.state import JOURNAL, RESULT, SessionState
 from calib.certificate import lever_arms_of
+from calib.fleet.spread import spread
 from calib.lever_arms.gauge import convert
 from imudrv.calibration import read_calibration
 from imudrv.errors import InputError
@@ -103,47 +102,14 @@ def reidentify_all(
     ----------
     folders : sequence of Path
         Sessions; with a scheduler, paths that its workers can read.
-    workers : int
-        Processes on this computer; 1: this one, without Dask.
-    scheduler : str, optional
-        Address of a Dask scheduler, such as ``tcp://host:8786``, whose workers do it instead.
+    workers, scheduler
+        See `spread`, also for what it raises.
 
     Yields
     ------
     Reidentified
-
-    Raises
-    ------
-    InputError
-        The package dask.distributed is absent, or the scheduler does not answer.
     """
-    if workers == 1 and scheduler is None:
-        yield from map(reidentify, folders)
-        return
-    distributed = _distributed()
     absolute = [folder.resolve() for folder in folders]
-    with _cluster(distributed, min(workers, len(folders)), scheduler) as client:
-        futures = client.map(reidentify, absolute, pure=False, retries=2)
-        for folder, future in zip(folders, futures, strict=True):
-            yield future.result()._replace(folder=folder)
-
-
-def _cluster(distributed: Any, workers: int, scheduler: str | None) -> Any:
-    if scheduler is None:
-        return distributed.Client(
-            n_workers=workers, threads_per_worker=1, dashboard_address=None, silence_logs=logging.ERROR
-        )
-    try:
-        return distributed.Client(scheduler, timeout=10)
-    except (OSError, ValueError) as error:
-        raise InputError(f"--scheduler {scheduler}: cannot connect: {error}; is it running?") from error
-
-
-def _distributed() -> Any:
-    try:
-        import distributed
-    except ImportError as error:
-        raise InputError(
-            "--workers, --scheduler: expected the package distributed: pip install imu50[dask]"
-        ) from error
-    return distributed
+    done = spread(reidentify, absolute, workers, scheduler)
+    for folder, one in zip(folders, done, strict=True):
+        yield one._replace(folder=folder)

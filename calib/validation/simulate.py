@@ -6,7 +6,7 @@ with its own noise; detection, alignment, navigation and estimate are those of `
 becomes the calibration of the trial. The truth is never used there.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -168,9 +168,7 @@ def trial(
     return navigate(label, simulated_pulses(run), settings, simulated_pulses(_twin(run)))
 
 
-def campaign(
-    names: Sequence[str], seeds: Sequence[int], filter_name: RateFilterName, say: Callable[[str], None]
-) -> Iterator[Trial]:
+def campaign(names: Sequence[str], seeds: Sequence[int], filter_name: RateFilterName) -> Iterator[Trial]:
     """Simulate trials with several units.
 
     Parameters
@@ -181,8 +179,6 @@ def campaign(
         Seed of each unit.
     filter_name : str
         Rate filter for the size effect.
-    say : callable
-        Called with the name of each part of the work.
 
     Yields
     ------
@@ -190,10 +186,8 @@ def campaign(
         All of the first unit, all of the second, ...
     """
     for seed in seeds:
-        say(f"unit {seed}: procedure")
         who = subject(scenario(names[0]).unit, seed)
         for name in names:
-            say(f"unit {seed}: {name}")
             yield trial(f"{name}, unit {seed}", scenario(name), who, seed, filter_name=filter_name)
 
 

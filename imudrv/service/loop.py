@@ -121,7 +121,8 @@ class Service:
         self._profile = self._profile_file.model
         self._layout = self._profile.layout()
         self._recordings = Recordings(self._create_recorder, history)
-        self._events = EventLog(say, warn or say, self._recordings.event, clock)
+        self._sinks = list(sinks)
+        self._events = EventLog(say, warn or say, self._pass_on, clock)
         self._calibration = CalibrationWatch(
             Path(settings.calibration), settings.unit, self._layout, self._events
         )
@@ -150,7 +151,6 @@ class Service:
         with ExitStack() as undo:
             if self._descriptor_loop is not None:
                 undo.callback(self._descriptor_loop.close)
-            self._sinks = list(sinks)
             for sink in sinks:
                 undo.callback(sink.close)
             for url in settings.outputs:
@@ -386,6 +386,14 @@ class Service:
             self._measure_rate(now)
         self._latest = latest = self._snapshot(now)
         self._recordings.status(lambda: latest().to_json())
+        for sink in self._sinks:
+            sink.status(lambda: latest().to_json())
+
+    def _pass_on(self, t_ns: int, text: str) -> None:
+        """Record an event, and hand it to the sinks."""
+        self._recordings.event(t_ns, text)
+        for sink in self._sinks:
+            sink.event(t_ns + self._events.offset_ns, text)
 
     def _status_line(self) -> bytes:
         return json.dumps(self._latest().to_json()).encode() + b"\n"

@@ -1,6 +1,7 @@
 """What every sink keeps to: where increments go; a slow, dead or absent consumer costs the loop nothing."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
 from typing import ClassVar, NamedTuple
 
 from imudrv.records import Records
@@ -137,6 +138,28 @@ class Sink(ABC):
         """Accept clients, send what is queued, reopen devices.
 
         Called eight times a second, and fifty times while `state` has samples in the queue.
+        """
+        return
+
+    def status(self, document: Callable[[], Mapping[str, object]]) -> None:
+        """Take the status of the service, once a second and after each event; most sinks have no use for it.
+
+        Parameters
+        ----------
+        document : callable
+            Returns values that JSON can represent; for any thread but that of the loop.
+        """
+        return
+
+    def event(self, t_ns: int, text: str) -> None:
+        """Take an event of the service; most sinks have no use for it.
+
+        Parameters
+        ----------
+        t_ns : int
+            UNIX time, ns.
+        text : str
+            What happened.
         """
         return
 

@@ -1,14 +1,15 @@
-"""Datagrams under a key of Zenoh."""
+"""Samples, status and events under a key of Zenoh."""
 
 import errno
 import os
 import select
 import time
+from collections.abc import Callable, Mapping
 from typing import Final
 
 from imudrv.sinks.backlog import Backlog
 from imudrv.sinks.base import Batch, Outlet, Sink, SinkState, Written
-from imudrv.streams import Publication
+from imudrv.streams import EVENTS, STATUS, Publication
 from imudrv.url import split
 from imudrv.wire.datagram import SIZE
 
@@ -17,7 +18,9 @@ _CLOSE_S: Final = 1.0
 
 
 class ZenohSink(Sink):
-    """Datagrams to all subscribers of a key, without loss while one of them stalls for some seconds.
+    """Samples to all subscribers of a key, without loss while one of them stalls for some seconds.
+
+    The status goes to ``KEY/status``, events to ``KEY/events``.
 
     Parameters
     ----------
@@ -67,6 +70,14 @@ class ZenohSink(Sink):
             self._backlog.flush(self._socket.send)
         except OSError as error:
             self._trouble = f"lost: {error.strerror or error}"
+
+    def status(self, document: Callable[[], Mapping[str, object]]) -> None:
+        """Publish the status."""
+        self._publication.note(STATUS, document)
+
+    def event(self, t_ns: int, text: str) -> None:
+        """Publish an event."""
+        self._publication.note(EVENTS, lambda: {"t_ns": t_ns, "text": text})
 
     @property
     def state(self) -> SinkState:

@@ -5,6 +5,7 @@
     tools/run python -m tools.soak fast [--seconds 60]         20 kHz
     tools/run python -m tools.soak fastest [--seconds 5]       100 kHz
     tools/run python -m tools.soak outputs [--minutes 30]      all outputs at once
+    tools/run python -m tools.soak zenoh [--seconds 60]        two subscribers, one of which stops
     tools/run python -m tools.soak faults [--seconds 20]       the same counts offline, live and recorded
     tools/run python -m tools.soak kill [--times 20]           recordings after kill -9
     tools/run python -m tools.soak unplug [--seconds 15]       and full disk, stuck and absent receivers
@@ -30,6 +31,7 @@ from .kill import kill
 from .line_faults import line_faults
 from .loopback import loopback
 from .outputs import outputs
+from .subscribers import subscribers
 from .virtual_hours import virtual_hours
 
 
@@ -49,6 +51,9 @@ TESTS: Final = {
     "fast": SoakTest(partial(loopback, rate_hz=20_000), "--seconds", 60, "every sample at 20 kHz"),
     "fastest": SoakTest(partial(loopback, rate_hz=100_000), "--seconds", 5, "every sample at 100 kHz"),
     "outputs": SoakTest(outputs, "--minutes", 30, "UDP, eight TCP clients, serial and recording at once"),
+    "zenoh": SoakTest(
+        subscribers, "--seconds", 60, "two services, two subscribers, of which one stops for 3 s"
+    ),
     "faults": SoakTest(line_faults, "--seconds", 20, "the same counts offline, live and recorded"),
     "kill": SoakTest(kill, "--times", 20, "recordings after kill -9"),
     "unplug": SoakTest(disruption, "--seconds", 15, "unplugged port, full disk, stuck and absent receivers"),

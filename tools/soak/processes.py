@@ -135,7 +135,7 @@ class Stage(ExitStack):
     def unit(self, port: str, profile: str, speed: str, *options: object) -> Child:
         """Start a simulated unit that plays ``scenario.yaml``."""
         command = ["sim", "scenario.yaml", "--profile", profile, "--port", port, "--speed", speed, *options]
-        return self._started(Child(self._folder, "-m", "imudrv", *command), "plays on")
+        return self.imudrv("plays on", *command)
 
     def service(self, port: str, profile: str, *options: object) -> Service:
         """Start the service."""
@@ -150,6 +150,10 @@ class Stage(ExitStack):
         service = self.service(port, profile, *options)
         service.await_port("silent")
         return self.unit(port, profile, speed), service
+
+    def imudrv(self, words: str, *arguments: object) -> Child:
+        """Start another command, and wait for these words of it."""
+        return self._started(Child(self._folder, "-m", "imudrv", *arguments), words)
 
     def listener(self, url: str, name: str) -> Child:
         """Start a receiver that stores what it receives in a file."""
