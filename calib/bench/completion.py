@@ -6,23 +6,22 @@ from typing import Final
 from calib.bench.entries import Decision
 from calib.bench.journal import journal_dates
 from calib.bench.keys import Keyboard
+from calib.bench.kinds import SessionResult, compute
 from calib.bench.queue_sink import QueueReader
-from calib.bench.result import Result, identify_session
+from calib.bench.rest_results import RestsResult
+from calib.bench.result import Result
 from calib.bench.screen import OperatorScreen
 from calib.bench.session import Session
 from calib.bench.simulated_unit import is_rehearsal
 from calib.bench.state import JOURNAL, REPORT, RESULT
 from calib.bench.web_console import WebConsole
-from calib.certificate import check_target, write
+from calib.certificate import check_unit_file, write
 from calib.lever_arms.gauge import convert
 from calib.messages import Message, english, message
 from calib.procedure.events import Rejected, Skipped
 from calib.reports.certificate import Particulars
 from calib.reports.certificate import document as certificate_document
 from calib.reports.html import as_html
-from calib.reports.identification import arms_text
-from calib.reports.verdict import verdict
-from imudrv.calibration import Calibration, read_calibration
 from imudrv.errors import InputError
 from imudrv.files import atomic, settings_file
 from imudrv.files.atomic import atomic_write
@@ -35,25 +34,24 @@ _MARKS: Final = {
 }
 
 
-def session_result(session: Session) -> Result:
-    """Return the result of the recordings; its certificate is written once and then read back."""
-    result = identify_session(session)
-    path = session.path(RESULT)
-    if RESULT in session.files:
-        return result._replace(certificate=read_calibration(path))
-    path.unlink(missing_ok=True)  # of a process that was killed before it recorded the file
-    write(path, result.certificate, session.key)
-    session.record_file(RESULT)
+def session_result(session: Session) -> SessionResult:
+    """Return the result of the recordings; its certificate, if there is one, is written once."""
+    result = compute(session)
+    if RESULT not in session.files and result.certificate is not None:
+        path = session.path(RESULT)
+        path.unlink(missing_ok=True)  # of a process that was killed before it recorded the file
+        write(path, result.certificate, session.key)
+        session.record_file(RESULT)
     return result
 
 
-def decide_alone(result: Result) -> bool:
+def decide_alone(result: SessionResult) -> bool:
     """Return whether the verdicts on a result allow to accept it without an operator."""
-    return all(mark != "bad" for mark, _ in verdict(result.identification))
+    return all(mark != "bad" for mark, _ in result.verdicts)
 
 
 def ask_operator(
-    result: Result,
+    result: SessionResult,
     unit: str,
     screen: OperatorScreen,
     keys: Keyboard,
@@ -64,7 +62,7 @@ def ask_operator(
 
     Parameters
     ----------
-    result : Result
+    result : SessionResult
         The result.
     unit : str
         Serial number.
@@ -98,22 +96,20 @@ def ask_operator(
     return answer
 
 
-def summarise(result: Result, screen: OperatorScreen) -> None:
+def summarise(result: SessionResult, screen: OperatorScreen) -> None:
     """Print what the operator needs for the decision."""
-    screen.print(arms_text(result.identification.arms))
-    for mark, text in verdict(result.identification):
+    screen.print(result.text)
+    for mark, text in result.verdicts:
         screen.say(message("mark", mark=_MARKS[mark], text=text))
 
 
-def activate(session: Session, certificate: Calibration) -> None:
+def activate(session: Session) -> None:
     """Make the result the active certificate, unless it is already.
 
     Parameters
     ----------
     session : Session
-        The session.
-    certificate : Calibration
-        Its result.
+        The session, with a result.
 
     Raises
     ------
@@ -121,9 +117,9 @@ def activate(session: Session, certificate: Calibration) -> None:
         The active certificate is neither the initial one nor the result, or that of another unit.
     """
     active = session.plan.certificate
-    digest = atomic.sha256(active.path)
+    digest = atomic.sha256(active.path) if active.path.exists() else None
     if digest == active.sha256:
-        check_target(active.path, certificate)
+        check_unit_file(active.path, session.plan.unit)
         settings_file.replace(active.path, atomic.content(session.path(RESULT)))
     elif digest != session.files[RESULT]:
         raise InputError(
@@ -143,21 +139,35 @@ def accepted_result(session: Session) -> tuple[Message, ...]:
     )
 
 
-def write_report(session: Session, result: Result, verified: Message | None = None) -> None:
+def write_report(session: Session, result: SessionResult, verified: Message | None = None) -> None:
     """Write the report and record its hash.
 
     Parameters
     ----------
     session : Session
         The session.
-    result : Result
-        Its result, accepted.
+    result : SessionResult
+        Its result.
     verified : Message, optional
-        Outcome of the verification; None: it is not done yet.
+        Outcome of the verification of arms; None: it is not done yet.
     """
+    watermark = "SIMULATED" if is_rehearsal(session.folder) else ""
+    if isinstance(result, Result):
+        page = _page_of_arms(session, result, verified, watermark)
+    elif isinstance(result, RestsResult):
+        page = as_html(result.document, watermark=watermark)
+    else:
+        raise TypeError(f"expected a result of a session, got {type(result).__name__}")
+    with atomic_write(session.path(REPORT)) as file:
+        file.write(page.encode())
+    session.record_file(REPORT)
+
+
+def _page_of_arms(session: Session, result: Result, verified: Message | None, watermark: str) -> str:
+    """Return the calibration certificate of the arms."""
     verified = message("verification_due") if verified is None else verified
     arms, identification = result.identification.arms, result.identification
-    plan, simulated = session.plan, is_rehearsal(session.folder)
+    plan = session.plan
     dates = journal_dates(session.folder / JOURNAL)
     particulars = Particulars(
         number=f"{plan.unit}-{identification.created:%Y%m%d}-{session.files[RESULT][:8]}",
@@ -167,16 +177,13 @@ def write_report(session: Session, result: Result, verified: Message | None = No
         measured=" to ".join(dict.fromkeys(dates)),
         attempts=tuple(_deviations(session)),
         verified=verified,
-        is_simulated=simulated,
+        is_simulated=bool(watermark),
     )
-    page = as_html(
+    return as_html(
         certificate_document(identification, (arms, convert(arms, "x")), particulars),
         number=particulars.number,
-        watermark="SIMULATED" if simulated else "",
+        watermark=watermark,
     )
-    with atomic_write(session.path(REPORT)) as file:
-        file.write(page.encode())
-    session.record_file(REPORT)
 
 
 def _deviations(session: Session) -> Iterator[tuple[str, str]]:

@@ -375,9 +375,9 @@ def _planned(procedure: Procedure) -> Iterator[tuple[str, Array]]:
     """Yield name and attitude C_bn of each planned rest; those of a rotation are one pose."""
     for rest in procedure.rests:
         yield rest.id, rest.C_bn
-    for step in procedure.steps:
-        yield step.id, step.C_bn
-        yield step.id, step.C_bn @ np.diag([-1.0, -1.0, 1.0])
+    for run in procedure.runs:
+        yield run.id, run.C_bn
+        yield run.id, run.C_bn @ np.diag([-1.0, -1.0, 1.0])
 
 
 def named_poses(attitudes: Sequence[Array], procedure: Procedure | None) -> tuple[str, ...]:

@@ -15,9 +15,10 @@ from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
 from calib.axes import Side, vector
+from calib.detection.rest_bins import Noise, RestBins
 from calib.sensors.adjustment import MEASURED_GRAVITY, NORMAL_GRAVITY, Free, information, posterior
 from calib.sensors.equations import Equations
-from calib.sensors.evidence import Evidence, Link, Noise, RestBins
+from calib.sensors.evidence import Evidence, Link
 from calib.sensors.motion import SAMPLE
 from calib.sensors.observability import RATIO
 from calib.sensors.parameters import NominalScales, Number, Parameters, start_parameters
