@@ -4,7 +4,7 @@ A count at the edge of a rest is the mean over a bin of (count - rate t), which 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import sqrt
 from typing import Final
 
@@ -61,6 +61,8 @@ class RestBins:
         Largest change of any of these from bin to bin of the rest.
     shaking : float
         Largest scatter of single angle increments of a gyro, rad, rms.
+    beginning : ndarray, shape (n, 3)
+        The first angle increments, rad: they show a dither line.
     """
 
     session: int
@@ -74,6 +76,7 @@ class RestBins:
     degc: Array
     span_k: float = 0.0
     shaking: float = 0.0
+    beginning: Array = field(default_factory=lambda: np.zeros((0, 3)), repr=False)
 
     @property
     def duration_s(self) -> float:

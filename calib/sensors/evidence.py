@@ -10,6 +10,7 @@ from math import pi
 import numpy as np
 
 from calib.detection.rest_bins import Noise, RestBins
+from calib.estimation.dither_line import DitherLine
 from calib.sensors.motion import STEADY
 from imudrv.arrays import Array
 from imudrv.imu.rate_filter import RateFilter
@@ -76,6 +77,8 @@ class Evidence:
         Largest rate of any gyro in a motion, rad/s.
     rate_filter : RateFilter
         For the rate of the size effect: without the dither that the increments of the gyros carry.
+    dither : tuple of DitherLine
+        Its lines in the first rest.
     """
 
     rests: tuple[RestBins, ...]
@@ -85,6 +88,7 @@ class Evidence:
     quanta: tuple[float, float]
     fastest: float = 0.0
     rate_filter: RateFilter = STEADY
+    dither: tuple[DitherLine, ...] = ()
 
     @property
     def is_dithered(self) -> bool:

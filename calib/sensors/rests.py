@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from calib.detection.rest_bins import BIN_S, LEAST_RESTS, Noise, RestBins, binned, rest_noise
 from calib.detection.segments import Segmenter
+from calib.estimation.dither_line import dither_lines
 from calib.messages import english
 from calib.sensors.evidence import Evidence, Left, Link
 from calib.sensors.motion import SAMPLE, STEADY
@@ -103,7 +104,8 @@ def read_evidence(
                 left.append(item)
     ordered = tuple(sorted(left, key=lambda one: (one.session, one.start_s)))
     rates = _rate_filter(still, noise, quanta[0], layout)
-    return Evidence(tuple(still), tuple(links), ordered, noise, quanta, fastest, rates)
+    dither = dither_lines(still[0].beginning, samples_s(layout))
+    return Evidence(tuple(still), tuple(links), ordered, noise, quanta, fastest, rates, dither)
 
 
 KNOCK_S: Final = 10.0
@@ -123,6 +125,8 @@ def _division(link: Link, rests: Sequence[RestBins], cuts: Set[tuple[int, int]])
     yield Left(before.session, before.start_s, after.stop_s, "rest", reason)
 
 
+DITHER_S: Final = 4.0
+"""Length of the beginning of a rest that shows a dither line, s."""
 DITHER: Final = 0.5 * ARCSEC
 """Scatter of an angle increment beside pulses and noise that counts as dither, rms."""
 
@@ -197,6 +201,7 @@ class _Binner:
         self._samples = samples
         self.runs: list[tuple[int, list[Array], list[Array], list[Array]]] = []
         self._squares: list[Array] = []  # variance of the gyros' increments, bin by bin
+        self._first: list[Array] = []
         self.bad = 0
         self.gaps = 0
         self._rest: Array = np.zeros((0, 10))
@@ -223,6 +228,14 @@ class _Binner:
                 some.append(new)
             degc.append(bins[:, :, 6:].mean(axis=1))
             self._squares.append(bins[:, :, :3].var(axis=1))
+            if sum(map(len, self._first)) < DITHER_S / BIN_S * self._samples:
+                self._first.append(bins[:, :, :3].reshape(-1, 3))
+
+    @property
+    def beginning(self) -> Array:
+        """The first angle increments, shape (n, 3)."""
+        most = round(DITHER_S / BIN_S) * self._samples
+        return np.concatenate(self._first)[:most] if self._first else np.zeros((0, 3))
 
     @property
     def shaking(self) -> float:
@@ -294,6 +307,7 @@ def _bins(
                 temperatures.mean(axis=0),
                 span,
                 binner.shaking,
+                binner.beginning,
             )
         )
     return rests, left
