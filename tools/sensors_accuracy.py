@@ -177,7 +177,7 @@ def units(arguments: argparse.Namespace) -> None:
         if not result.estimates:
             raise RuntimeError(f"unit {seed}: {result}")
         found.append(errors(result, truth))
-        found[-1]["K, ppm"] -= -gravity / SITE.gravity * 1e6 if arguments.known_gravity else 0.0
+        found[-1]["K, ppm"] -= gravity / SITE.gravity * 1e6 if arguments.known_gravity else 0.0
         stated.append(sigmas(result))
         one, n = nees(result, truth)
         squares, freedom = squares + one, freedom + n

@@ -5,14 +5,16 @@ from collections.abc import Iterator
 from calib.bench.entries import Decision
 from calib.bench.journal import journal_dates
 from calib.bench.keys import Keyboard
+from calib.bench.kinds import SessionResult, compute
 from calib.bench.queue_sink import QueueReader
-from calib.bench.result import Result, identify_session
+from calib.bench.rest_results import RestsResult
+from calib.bench.result import Result
 from calib.bench.screen import OperatorScreen
 from calib.bench.session import Session
 from calib.bench.simulated_unit import is_rehearsal
 from calib.bench.state import JOURNAL, REPORTS, RESULT
 from calib.bench.web_console import WebConsole
-from calib.certificate import check_target, write
+from calib.certificate import check_unit_file, write
 from calib.lever_arms.gauge import convert
 from calib.messages import Message, message, text
 from calib.procedure.events import Rejected, Skipped
@@ -20,33 +22,29 @@ from calib.reports.certificate import Particulars
 from calib.reports.certificate import documents as certificate_documents
 from calib.reports.document import MARK_NAMES
 from calib.reports.html import as_html
-from calib.reports.identification import arms_text
-from calib.reports.verdict import verdict
-from imudrv.calibration import Calibration, read_calibration
 from imudrv.errors import InputError
 from imudrv.files import atomic, settings_file
 from imudrv.files.atomic import atomic_write
 
 
-def session_result(session: Session) -> Result:
-    """Return the result of the recordings; its certificate is written once and then read back."""
-    result = identify_session(session)
-    path = session.path(RESULT)
-    if RESULT in session.files:
-        return result._replace(certificate=read_calibration(path))
-    path.unlink(missing_ok=True)  # of a process that was killed before it recorded the file
-    write(path, result.certificate, session.key)
-    session.record_file(RESULT)
+def session_result(session: Session) -> SessionResult:
+    """Return the result of the recordings; its certificate, if there is one, is written once."""
+    result = compute(session)
+    if RESULT not in session.files and result.certificate is not None:
+        path = session.path(RESULT)
+        path.unlink(missing_ok=True)  # of a process that was killed before it recorded the file
+        write(path, result.certificate, session.key)
+        session.record_file(RESULT)
     return result
 
 
-def decide_alone(result: Result) -> bool:
+def decide_alone(result: SessionResult) -> bool:
     """Return whether the verdicts on a result allow to accept it without an operator."""
-    return all(mark != "bad" for mark, _ in verdict(result.identification))
+    return all(mark != "bad" for mark, _ in result.verdicts)
 
 
 def ask_operator(
-    result: Result,
+    result: SessionResult,
     unit: str,
     screen: OperatorScreen,
     keys: Keyboard,
@@ -57,7 +55,7 @@ def ask_operator(
 
     Parameters
     ----------
-    result : Result
+    result : SessionResult
         The result.
     unit : str
         Serial number.
@@ -91,22 +89,20 @@ def ask_operator(
     return answer
 
 
-def summarise(result: Result, screen: OperatorScreen) -> None:
+def summarise(result: SessionResult, screen: OperatorScreen) -> None:
     """Print what the operator needs for the decision."""
-    screen.print(arms_text(result.identification.arms))
-    for mark, why in verdict(result.identification):
+    screen.print(result.text)
+    for mark, why in result.verdicts:
         screen.say(message("mark", mark=MARK_NAMES[mark], text=why))
 
 
-def activate(session: Session, certificate: Calibration) -> None:
+def activate(session: Session) -> None:
     """Make the result the active certificate, unless it is already.
 
     Parameters
     ----------
     session : Session
-        The session.
-    certificate : Calibration
-        Its result.
+        The session, with a result.
 
     Raises
     ------
@@ -114,9 +110,9 @@ def activate(session: Session, certificate: Calibration) -> None:
         The active certificate is neither the initial one nor the result, or that of another unit.
     """
     active = session.plan.certificate
-    digest = atomic.sha256(active.path)
+    digest = atomic.sha256(active.path) if active.path.exists() else None
     if digest == active.sha256:
-        check_target(active.path, certificate)
+        check_unit_file(active.path, session.plan.unit)
         settings_file.replace(active.path, atomic.content(session.path(RESULT)))
     elif digest != session.files[RESULT]:
         raise InputError(
@@ -136,21 +132,36 @@ def accepted_result(session: Session) -> tuple[Message, ...]:
     )
 
 
-def write_report(session: Session, result: Result, verified: Message | None = None) -> None:
-    """Write the report in each language and record its hash.
+def write_report(session: Session, result: SessionResult, verified: Message | None = None) -> None:
+    """Write the report, that of arms in each language, and record the hashes.
 
     Parameters
     ----------
     session : Session
         The session.
-    result : Result
-        Its result, accepted.
+    result : SessionResult
+        Its result.
     verified : Message, optional
-        Outcome of the verification; None: it is not done yet.
+        Outcome of the verification of arms; None: it is not done yet.
     """
+    if isinstance(result, Result):
+        pages = _pages_of_arms(session, result, verified)
+    elif isinstance(result, RestsResult):
+        pages = {"en": as_html(result.document, watermark=_watermark(session, "en"))}
+    else:
+        raise TypeError(f"expected a result of a session, got {type(result).__name__}")
+    for language, page in pages.items():
+        name = REPORTS[language]
+        with atomic_write(session.path(name)) as file:
+            file.write(page.encode())
+        session.record_file(name)
+
+
+def _pages_of_arms(session: Session, result: Result, verified: Message | None) -> dict[str, str]:
+    """Return the calibration certificate of the arms, by language."""
     verified = message("verification_due") if verified is None else verified
     arms, identification = result.identification.arms, result.identification
-    plan, is_simulated = session.plan, is_rehearsal(session.folder)
+    plan = session.plan
     particulars = Particulars(
         number=f"{plan.unit}-{identification.created:%Y%m%d}-{session.files[RESULT][:8]}",
         bench=session.bench(),
@@ -167,17 +178,19 @@ def write_report(session: Session, result: Result, verified: Message | None = No
         verified=verified,
     )
     documents = certificate_documents(identification, (arms, convert(arms, "x")), particulars)
-    for language, document in documents.items():
-        name = REPORTS[language]
-        page = as_html(
+    return {
+        language: as_html(
             document,
             number=particulars.number,
-            watermark=text(message("certificate_simulated"), language) if is_simulated else "",
+            watermark=_watermark(session, language),
             language=language,
         )
-        with atomic_write(session.path(name)) as file:
-            file.write(page.encode())
-        session.record_file(name)
+        for language, document in documents.items()
+    }
+
+
+def _watermark(session: Session, language: str) -> str:
+    return text(message("certificate_simulated"), language) if is_rehearsal(session.folder) else ""
 
 
 def _deviations(session: Session) -> Iterator[tuple[Message, Message]]:

@@ -35,8 +35,9 @@ from calib.bench.completion import (
 )
 from calib.bench.entries import Counted, Decision, ServiceMessage, SessionEnded, UnitDetected
 from calib.bench.keys import Keyboard
+from calib.bench.kinds import SessionResult
 from calib.bench.queue_sink import QueueReader, QueueSink, ServiceEndedError
-from calib.bench.recordings import AttemptRecordings
+from calib.bench.recordings import SessionRecordings
 from calib.bench.result import Result, residual_velocity
 from calib.bench.resume import require_temperature
 from calib.bench.screen import OperatorScreen, with_port_state
@@ -54,10 +55,11 @@ from calib.procedure.events import (
     Finished,
     Phase,
     Rejected,
+    RestAccepted,
     View,
 )
-from calib.procedure.plan import steps_left, verification
-from calib.procedure.schema import VERIFICATION, Procedure
+from calib.procedure.plan import all_steps, steps_left, verification
+from calib.procedure.schema import VERIFICATION, Procedure, Run
 from imudrv.errors import InputError
 from imudrv.records import INCREMENTS, Records
 from imudrv.service.loop import Service
@@ -126,10 +128,10 @@ class SessionController:
         self.is_undecided = False
         self._session, self._layout, self._service = session, layout, service
         self._procedure = procedure = session.procedure()
-        self._steps = {step.id: step for step in (*procedure.steps, *verification(procedure).steps)}
+        self._runs = {step.id: step for step in all_steps(procedure) if isinstance(step, Run)}
         self._sink, self._screen, self._keys = queue, screen, keys
         self._queue = QueueReader(queue, lambda text: session.append(ServiceMessage(text)))
-        self._recordings = AttemptRecordings(session, service, self._queue)
+        self._recordings = SessionRecordings(session, service, self._queue)
         self._hands_free, self._accepts, self._begin = hands_free, accepts, begin
         self._watch, self._web = watch, web
         self._is_unit_detected = False
@@ -163,6 +165,14 @@ class SessionController:
         result = session_result(session)
         if self._sink.is_closed:
             raise ServiceEndedError  # nothing is decided after Ctrl-C
+        if not isinstance(result, Result) and session.stage(Decision) is None:
+            write_report(session, result)  # there is one without a certificate, too
+        if result.certificate is None:
+            summarise(result, self._screen)
+            session.end(Decision(False))
+            report = str(session.folder / REPORT)
+            self.outcome = (message("no_certificate"), message("report", path=report))
+            return
         decision = self._decision(result)
         if decision is None:
             self.is_undecided = True
@@ -172,7 +182,11 @@ class SessionController:
             path = str(session.plan.certificate.path)
             self.outcome = (message("result_rejected", path=path),)
             return
-        activate(session, result.certificate)
+        activate(session)
+        if not isinstance(result, Result):
+            session.end(SessionEnded(None))
+            self.outcome = accepted_result(session)
+            return
         if REPORT not in session.files:
             write_report(session, result)
         for line in accepted_result(session):
@@ -188,7 +202,7 @@ class SessionController:
         session.end(SessionEnded(residual))
         self.outcome = (*accepted_result(session), message("verification", result=verified))
 
-    def _decision(self, result: Result) -> Decision | None:
+    def _decision(self, result: SessionResult) -> Decision | None:
         """Return the decision in the journal, or take it now; None: nobody is there."""
         decision = self._session.stage(Decision)
         if decision is None:
@@ -220,6 +234,7 @@ class SessionController:
             hands_free=self._hands_free,
             accepted=accepted,
             attempts={name: session.next_attempt(name) - 1 for name in ids},
+            rested_s=session.rested_s,
         )
         last = self._apply_events(engine, engine.feed(np.zeros(0, INCREMENTS)))
         if last is None:
@@ -289,16 +304,20 @@ class SessionController:
             if isinstance(event, Accepted):
                 if reason := self._file(engine, event):
                     waiting += engine.reject(event.step_id, reason)
+            elif isinstance(event, RestAccepted):
+                self._recordings.accept(event)
             elif isinstance(event, Finished):
                 last = event  # journaled with the stage
+                for step_id, reason in self._recordings.end_of_rests():
+                    waiting += engine.reject(step_id, reason)
             else:
                 if isinstance(event, Aborted):
                     last = event
                 elif isinstance(event, Rejected):
-                    self._recordings.end()
+                    self._recordings.end_of_attempt()
                     last = None
                 elif isinstance(event, Entered) and event.phase is Phase.PLACE:
-                    self._recordings.begin(f"run-{event.step_id}-{event.attempt}", event.counter)
+                    self._recordings.begin(event)
                 self._session.append(event)
         return last
 
@@ -306,7 +325,7 @@ class SessionController:
         """File an accepted attempt; return why that is impossible."""
         log = next(log for log in reversed(engine.runs) if log.step_id == event.step_id)
         degc = self._conditions.temperature_degc
-        return self._recordings.file(self._steps[event.step_id], event, log, degc)
+        return self._recordings.file(self._runs[event.step_id], event, log, degc)
 
 
 def _conditions(pulses: Records, layout: Layout) -> Conditions:

@@ -23,7 +23,9 @@ from calib.procedure.events import (
     Finished,
     Redone,
     Rejected,
+    RestAccepted,
     Restarted,
+    Rested,
     Skipped,
     Turned,
 )
@@ -97,10 +99,10 @@ class EmbeddedFile:
 
 @dataclass(frozen=True)
 class CertificateFile:
-    """The unit's active certificate: its path, and its SHA-256 when the session began."""
+    """The unit's active certificate: its path, and its SHA-256 when the session began, None without one."""
 
     path: AbsolutePath
-    sha256: Digest
+    sha256: Digest | None
 
 
 def _undamaged(file: EmbeddedFile) -> EmbeddedFile:
@@ -183,6 +185,21 @@ class AcceptedStep(Accepted):
             raise ValueError(f"samples: expected at most the {span} of the counters, got {self.samples}")
 
 
+@dataclass(frozen=True, kw_only=True)
+class AcceptedRest(RestAccepted):
+    """An accepted rest; its recording goes on, and is closed and recorded later."""
+
+    recording: FileName
+
+    def __post_init__(self) -> None:
+        """Refuse counters in the wrong order, and another number of samples than they span allows."""
+        span = self.last_counter - self.first_counter + 1
+        if span < 1:
+            raise ValueError(f"last_counter: expected at least {self.first_counter}, got {self.last_counter}")
+        if self.samples is None or self.samples > span:
+            raise ValueError(f"samples: expected at most the {span} of the counters, got {self.samples}")
+
+
 @dataclass(frozen=True)
 class ServiceMessage:
     """A message of the driver service."""
@@ -258,7 +275,17 @@ class Signed:
 
 
 Counted: TypeAlias = (
-    Entered | Checked | Restarted | Turned | Rejected | Skipped | Redone | Finished | Aborted | UnitDetected
+    Entered
+    | Checked
+    | Restarted
+    | Turned
+    | Rested
+    | Rejected
+    | Skipped
+    | Redone
+    | Finished
+    | Aborted
+    | UnitDetected
 )
 """Entries with the counter of the newest sample."""
 
@@ -268,6 +295,7 @@ Entry: TypeAlias = (
     | Plan
     | FileRecorded
     | AcceptedStep
+    | AcceptedRest
     | ServiceMessage
     | Decision
     | SessionEnded
@@ -280,6 +308,7 @@ Entry: TypeAlias = (
 _SPECIAL_NAMES: Final[Mapping[type[Entry], str]] = {
     FileRecorded: "file",
     AcceptedStep: "accepted",
+    AcceptedRest: "rest",
     ServiceMessage: "service",
     UnitDetected: "heard",
     SessionEnded: "end",

@@ -1,16 +1,17 @@
-"""Results of the accepted recordings: lever arms, and the residual velocity after a rotation.
+"""Results of accepted runs: lever arms, and the residual velocity after a rotation.
 
 Both are computed from the wire bytes of the recordings, cut to the samples on which the engine accepted the
 attempt.
 """
 
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from pathlib import Path
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.bench.entries import ResidualVelocity
+from calib.bench.entries import AcceptedRest, ResidualVelocity
 from calib.bench.state import Attempt, SessionState
 from calib.certificate import certificate
 from calib.detection.blocks import BLOCK_NS
@@ -24,9 +25,11 @@ from calib.identification import (
     PriorCalibration,
     temperature_ranges,
 )
-from calib.messages import english
+from calib.messages import Message, english
 from calib.procedure.plan import verification
 from calib.procedure.schema import VERIFICATION, Procedure
+from calib.reports.identification import arms_text
+from calib.reports.verdict import verdict
 from imudrv.calibration import Calibration, coefficients
 from imudrv.errors import InputError
 from imudrv.files import atomic
@@ -35,6 +38,7 @@ from imudrv.imu.sequence import SampleCounts, SequenceTracker
 from imudrv.recording.reader import Recording
 from imudrv.records import Records
 from imudrv.site import Site
+from imudrv.units import MM
 from imudrv.wire.decoder import FrameDecoder
 from imudrv.wire.layout import Layout, SequenceKind
 
@@ -49,7 +53,7 @@ _ROUNDING: Final = 1e-5
 
 
 class Result(NamedTuple):
-    """Result of the accepted recordings.
+    """Result of the accepted runs, see `calib.bench.kinds.SessionResult`.
 
     Attributes
     ----------
@@ -61,6 +65,30 @@ class Result(NamedTuple):
 
     identification: IdentificationResult
     certificate: Calibration
+
+    @property
+    def verdicts(self) -> tuple[tuple[str, Message], ...]:
+        """Marks and reasons."""
+        return tuple(verdict(self.identification))
+
+    @property
+    def text(self) -> str:
+        """What the operator needs for the decision."""
+        return arms_text(self.identification.arms)
+
+    @property
+    def page(self) -> dict[str, Any]:
+        """The same for the page: a table, and the three points."""
+        arms = self.identification.arms
+        rows: list[list[str]] = [["", "X", "Y", "Z"]]
+        for axis, r in zip("xyz", (arms.r_b / MM).tolist(), strict=True):
+            rows.append([f"r_{axis}", *(f"{value:+.3f}" for value in r)])
+        if arms.covariance is not None:
+            sigma_mm = np.sqrt(np.diag(arms.covariance)).reshape(3, 3) / MM
+            rows[0] += ["u(X)", "u(Y)", "u(Z)"]
+            for row, u in zip(rows[1:], sigma_mm.tolist(), strict=True):
+                row += [f"{value:.3f}" for value in u]
+        return {"table": rows, "gauge": arms.gauge, "r_mm": (arms.r_b / MM).tolist()}
 
 
 class DecodedRecording(NamedTuple):
@@ -121,7 +149,7 @@ def identify(
     bare = prior_calibration.calibration.without_size_effect().without_skew()
     sources = tuple(_summarise(procedure, attempt, bare, site) for attempt in attempts)
     result = estimate_joint([run for source in sources for run in source.rotations.runs], priors)
-    limits = procedure.rotation_limits(procedure.steps[0])
+    limits = procedure.rotation_limits(procedure.runs[0])
     identification = IdentificationResult(result, prior_calibration, site, limits, priors, sources)
     return Result(identification, certificate(identification, identification.arms))
 
@@ -145,6 +173,55 @@ def uncovered(attempt: Attempt) -> str:
         The recording cannot be read.
     """
     return _missing(attempt, _decode(attempt))
+
+
+def uncovered_rests(path: Path, rests: Sequence[AcceptedRest]) -> dict[str, str]:
+    """Describe the samples of rests that their recording lacks.
+
+    Parameters
+    ----------
+    path : Path
+        A recording that is closed, or was cut; read once, in a memory that does not depend on its length.
+    rests : sequence of AcceptedRest
+        Rests accepted while it was written.
+
+    Returns
+    -------
+    dict of str to str
+        Phrases with the counters by step id, of the rests that are not complete in it. Of a unit that does
+        not number its samples only their number is known.
+
+    Raises
+    ------
+    InputError
+        The recording cannot be read.
+    """
+    recording = Recording(path)
+    layout = recording.profile.layout()
+    is_counted = layout.sequence.kind is SequenceKind.COUNTER
+    decoder, tracker = FrameDecoder(layout), SequenceTracker(layout)
+    found, total, offset = [0] * len(rests), 0, None
+    for reads in recording.reads():
+        counter = tracker.feed(decoder.feed_reads(reads.data, reads.ends, reads.times))["counter"]
+        total += len(counter)
+        if not len(counter) or not is_counted:
+            continue
+        if offset is None:
+            offset = _offset(recording, rests[-1].last_counter, int(counter[0]), layout)
+        number = (counter + offset) // layout.counter_step
+        for k, rest in enumerate(rests):
+            first, stop = np.searchsorted(number, [rest.first_counter, rest.last_counter + 1])
+            found[k] += int(stop - first)
+    if not is_counted:
+        before = 0
+        for k, rest in enumerate(rests):
+            before += rest.samples
+            found[k] = rest.samples if total >= before else 0
+    return {
+        rest.step_id: f"its recording does not cover counters {rest.first_counter}..{rest.last_counter}"
+        for rest, samples in zip(rests, found, strict=True)
+        if samples < rest.samples
+    }
 
 
 def residual_velocity(session: SessionState, calibration: Calibration) -> ResidualVelocity:
@@ -264,12 +341,17 @@ def _by_counter(
     begin = int(backward[-1]) + 1 if len(backward) else 0
     counter = counter[begin:]
     if len(counter) and not begin:  # at a restart the service, too, begins with the unit's own number
-        first = int(counter[0])
-        published = next((int(rows["counter"][0]) for rows in recording.increments()), first // step)
-        published += _multiple(attempt.last_counter - published, _PUBLISHED_PERIOD)
-        # The counter may have wrapped before the recording.
-        counter = counter + _multiple(step * published - first, 1 << layout.sequence.bits)
+        counter = counter + _offset(recording, attempt.last_counter, int(counter[0]), layout)
     return begin, counter // step
+
+
+def _offset(recording: Recording, last: int, first: int, layout: Layout) -> int:
+    """Return what to add to the unit's counter, of which `first` is the first; `last` is in the service's."""
+    step = layout.counter_step
+    published = next((int(rows["counter"][0]) for rows in recording.increments()), first // step)
+    published += _multiple(last - published, _PUBLISHED_PERIOD)
+    # The counter may have wrapped before the recording.
+    return _multiple(step * published - first, 1 << layout.sequence.bits)
 
 
 def _by_increments(

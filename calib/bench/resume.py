@@ -7,11 +7,13 @@ from typing import Final
 import numpy as np
 from rich.console import Console
 
-from calib.bench.entries import EmbeddedFile, Resumed
+from calib.bench.entries import AcceptedStep, EmbeddedFile, Plan, Resumed
+from calib.bench.recordings import uncovered_steps
 from calib.bench.session import Session
 from calib.bench.state import REPORTS, RESULT
 from calib.bench.verify import faulty_files
 from calib.messages import Message, message, text
+from calib.procedure.events import Redone
 from imudrv import profiles
 from imudrv.calibration import read_calibration_file
 from imudrv.errors import InputError
@@ -51,13 +53,15 @@ def require_same(
     """
     plan, differ = session.plan, []
     active = calibration or plan.certificate.path
-    now = read_calibration_file(active)
-    if now.model.serial_number != plan.unit:
+    now = read_calibration_file(active) if active.exists() or plan.certificate.sha256 else None
+    if now is None:
+        pass  # there was none, and there is none yet
+    elif now.model.serial_number != plan.unit:
         differ.append(f"unit: expected {plan.unit!r}, got {now.model.serial_number!r} ({active})")
     elif now.sha256 not in (plan.certificate.sha256, session.files.get(RESULT)):
         differ.append(
-            f"certificate: expected the one that the session began with ({plan.certificate.sha256[:12]}), "
-            f"got another of the same unit ({active}, {now.sha256[:12]})"
+            f"certificate: expected the one that the session began with ({_began(plan)}), got another of the "
+            f"same unit ({active}, {now.sha256[:12]})"
         )
     given = [
         ("procedure", procedure, plan.procedure),
@@ -79,6 +83,10 @@ def require_same(
                 ]
             )
         )
+
+
+def _began(plan: Plan) -> str:
+    return "none" if plan.certificate.sha256 is None else plan.certificate.sha256[:12]
 
 
 def steps_message(session: Session) -> Message:
@@ -103,7 +111,8 @@ def require_temperature(session: Session, degc: Mapping[str, float | None]) -> N
         One differs by more than `RESUME_KELVIN`.
     """
     for name, now in degc.items():
-        known = [t for a in session.accepted.values() if (t := a.temperature_degc.get(name)) is not None]
+        accepted = [a for a in session.accepted.values() if isinstance(a, AcceptedStep)]
+        known = [t for a in accepted if (t := a.temperature_degc.get(name)) is not None]
         if now is None or not known:
             continue
         mean = float(np.mean(known))
@@ -150,4 +159,10 @@ def resume(
                 f"{session.folder}: not resumed and not changed; name another folder to begin anew"
             )
     session.redo(redo)
-    session.append(Resumed(session.record_leftovers()))
+    left = session.record_leftovers()
+    session.append(Resumed(left))
+    for name in left:
+        for step_id, why in uncovered_steps(session, name):
+            lost = message("rest_lost", step=step_id, why=why)
+            console.print(text(lost, language), markup=False, soft_wrap=True)
+            session.append(Redone(step_id, session.next_attempt(step_id), -1))

@@ -24,20 +24,21 @@ from calib.bench.screen import OperatorScreen
 from calib.bench.session import Session
 from calib.bench.simulated_unit import SimulatedUnitProcess, is_rehearsal
 from calib.bench.state import JOURNAL, REPORT, REPORTS, RESULT, WORKING_CERTIFICATE
-from calib.bench.technician import BENCH, mistakes_of
+from calib.bench.technician import BENCH, REHEARSED_UNIT, mistakes_of
 from calib.bench.web_console import WebConsole
 from calib.certificate import lever_arms_of
 from calib.inputs import require_six_axes
 from calib.messages import Message, language, message, text
 from calib.procedure import plan
 from calib.procedure.schema import Procedure
+from calib.reports.document import Document
 from calib.reports.pdf import renderer, write_pdf
 from calib.reports.text import as_text
-from calib.reports.truth import comparison
+from calib.reports.truth import calibration_comparison, comparison
 from calib.sensors import plan as sensors_plan
 from imudrv import profiles
 from imudrv.bench import BENCH_FILE, Bench
-from imudrv.calibration import coefficients, read_calibration
+from imudrv.calibration import Calibration, coefficients, read_calibration
 from imudrv.errors import InputError
 from imudrv.files import settings_file
 from imudrv.files.config_folder import config_file
@@ -79,7 +80,8 @@ class RunOptions:
     port, profile : str or None
         Port of the unit, and its wire format.
     calibration, site : Path or None
-        The unit's active certificate, and the site of the bench.
+        The unit's active certificate, and the site of the bench. Where the sensors are calibrated, the
+        certificate need not exist.
     procedure : str or None
         Name or path; None: `PROCEDURE`.
     hands_free : bool
@@ -284,10 +286,11 @@ def conduct(session: Session, options: RunOptions, console: Console, web: WebCon
             report = session.folder / name
             write_pdf(report, report.with_suffix(".pdf"))
             options.say(console, message("report", path=str(report.with_suffix(".pdf"))))
-    if simulated is not None:
-        result = session.folder / RESULT
-        found = lever_arms_of(read_calibration(result), str(result))
-        against = comparison(found, simulated.truth(layout), "the simulated unit")
+    result = session.folder / RESULT
+    if simulated is not None and RESULT in session.files:
+        against = _against_truth(
+            session, read_calibration(result), simulated.truth(layout, session.procedure().kind)
+        )
         console.print(as_text(against), markup=False, highlight=False, soft_wrap=True)
     return OK
 
@@ -304,6 +307,14 @@ def _show_end(
         options.say(console, line)
     if web is not None:
         web.end(lines)
+
+
+def _against_truth(session: Session, found: Calibration, true: Calibration) -> Document:
+    """Return the comparison of a result with the simulated unit."""
+    name = "the simulated unit"
+    if session.procedure().runs:
+        return comparison(lever_arms_of(found, RESULT), lever_arms_of(true, name), name)
+    return calibration_comparison(found, true, name)
 
 
 def _ask() -> bool:
@@ -343,11 +354,6 @@ def _create(options: RunOptions, console: Console) -> Session:
     """Create a session, and print the expected accuracy of its procedure."""
     folder, name = options.folder, options.procedure or PROCEDURE
     procedure = plan.load_file(name)
-    if procedure.model.kind != "arms":
-        raise InputError(
-            f"{name}: expected a procedure of kind arms, got one of kind {procedure.model.kind}; record all "
-            f"of it with imudrv run --record, then use calib {procedure.model.kind}"
-        )
     port, calibration, site, profile = options.port, options.calibration, options.site, options.profile
     if options.is_rehearsal:
         profile = profile or REHEARSAL_PROFILE
@@ -356,17 +362,20 @@ def _create(options: RunOptions, console: Console) -> Session:
         raise incomplete
     layout = require_six_axes(profiles.load(profile).layout())
     if options.is_rehearsal:
-        port, calibration, site = SimulatedUnitProcess(folder, options.speed).make(layout)
+        port, calibration, site = SimulatedUnitProcess(folder, options.speed).make(
+            layout, procedure.model.kind
+        )
     if port is None or calibration is None or site is None:
         raise incomplete
-    require_sensors(coefficients(read_calibration(calibration)), layout)
+    before = read_calibration(calibration) if calibration.exists() or procedure.model.runs else None
+    if before is not None:
+        require_sensors(coefficients(before), layout)
     place = settings_file.read_file(site, Site)
     bench_path = _bench_path(options)
     bench = None if bench_path is None else settings_file.read_file(bench_path, Bench)
-    operator = _operator(options, console, read_calibration(calibration).serial_number, bench)
-    worst_mm = float(plan.predicted(procedure.model, place.model).differences_sigma.max()) / MM
-    minutes = plan.duration_s(procedure.model) / 60.0
-    options.say(console, message("expected", folder=str(folder), minutes=minutes, worst_mm=worst_mm))
+    known = before.serial_number if before else REHEARSED_UNIT if options.is_rehearsal else None
+    unit, operator = _unit_and_operator(options, console, known, bench)
+    options.say(console, _expected(procedure.model, place.model, folder))
     return Session.create(
         folder,
         procedure=EmbeddedFile.of(name, procedure.content),
@@ -377,7 +386,17 @@ def _create(options: RunOptions, console: Console) -> Session:
         bench=None if bench is None else EmbeddedFile.of(str(bench_path), bench.content),
         operator=operator,
         received=options.received.isoformat() if options.received else "",
+        unit=unit,
     )
+
+
+def _expected(procedure: Procedure, site: Site, folder: Path) -> Message:
+    """Return how long a session takes, and its expected accuracy."""
+    minutes, steps = plan.duration_s(procedure) / 60.0, len(procedure.steps)
+    if not procedure.runs:
+        return message("expected_rests", folder=str(folder), minutes=minutes, rests=steps)
+    worst_mm = float(plan.predicted(procedure, site).differences_sigma.max()) / MM
+    return message("expected", folder=str(folder), minutes=minutes, worst_mm=worst_mm)
 
 
 def _bench_path(options: RunOptions) -> Path | None:
@@ -388,21 +407,21 @@ def _bench_path(options: RunOptions) -> Path | None:
     return default if default is not None and default.is_file() else None
 
 
-def _operator(
-    options: RunOptions, console: Console, unit: str, bench: settings_file.SettingsFile[Bench] | None
-) -> str:
-    """Return the operator; refuse another unit than that of the certificate; ask for what is not given."""
+def _unit_and_operator(
+    options: RunOptions, console: Console, unit: str | None, bench: settings_file.SettingsFile[Bench] | None
+) -> tuple[str | None, str]:
+    """Return unit and operator; refuse another unit than the certificate's; ask for what is not given."""
     asks = options.has_operator and not options.is_rehearsal and Keyboard().there
     serial, operator = options.unit, options.operator
     if serial is None and asks:
         options.say(console, message("ask_unit"))
         serial = console.input().strip()  # a scanner types, too
-    if serial is not None and serial != unit:
+    if serial is not None and unit is not None and serial != unit:
         raise InputError(f"expected unit {unit!r} of the certificate, got {serial!r}; connect that unit")
     if operator is None and asks:
         options.say(console, message("ask_operator"))
         operator = console.input().strip()
-    return operator or ("" if bench is None else bench.model.operator)
+    return unit or serial, operator or ("" if bench is None else bench.model.operator)
 
 
 def _require_resumable(session: Session, options: RunOptions) -> None:

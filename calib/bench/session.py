@@ -2,17 +2,20 @@
 
 ====================  ===================================================================================
 ``journal.jsonl``     see `calib.bench.journal`; its first line is the plan
-``before.yaml``       the unit's certificate at the beginning
+``before.yaml``       the unit's certificate at the beginning, if there was one
 ``working.yaml``      the same without size effect and skew: the service compensates with it
 ``profile.yaml``      the plan's profile for the service, unless it is a shipped one
 ``run-STEP-N.mcap``   recording of the N-th attempt at a step, and ``run-STEP-N.npz`` its velocity and H
+``run-N.mcap``        of the sensors and the noise: all from the first rest to the last; one more after each
+                      time that the session is resumed
 ``certificate.yaml``  the result, and ``report.html``
 ====================  ===================================================================================
 
-The SHA-256 of each file is written to the journal once the file is closed. A step is accepted only when its
-files are recorded there and its recording has been decoded and found to cover the attempt. The
-result can therefore always be computed again from the files. A bench with a key signs the certificate and the
-end of the journal.
+The SHA-256 of each file is written to the journal once the file is closed. A run is accepted only when its
+files are recorded there and its recording has been decoded and found to cover the attempt. A rest is accepted
+while its recording goes on; once that is closed, or found after a kill, a rest that it does not cover is
+asked for again. The result can therefore always be computed again from the files. A bench with a key signs
+the certificate and the end of the journal.
 """
 
 import hashlib
@@ -43,12 +46,14 @@ from calib.bench.state import (
     SessionState,
     require_session,
 )
+from calib.bench.working import working_certificate
 from calib.procedure.events import Redone
-from calib.procedure.schema import VERIFICATION
+from calib.procedure.schema import VERIFICATION, Procedure
 from calib.signing.keys import BenchKey, bench_key
 from imudrv import profiles
 from imudrv.calibration import Calibration, read_calibration, read_calibration_file, write_calibration
 from imudrv.errors import InputError
+from imudrv.files import settings_file
 from imudrv.files.atomic import atomic_write, sync_folder
 from imudrv.files.lock import FileLock
 
@@ -74,7 +79,8 @@ class Session(SessionState):
         super().__init__(folder, self._journal.entries)
         self.dropped = self._journal.dropped
         for name in (INITIAL_CERTIFICATE, WORKING_CERTIFICATE):
-            if name not in self.files:
+            is_there = name != INITIAL_CERTIFICATE or self.plan.certificate.sha256 is not None
+            if is_there and name not in self.files:
                 self.record_file(name)
 
     @classmethod
@@ -90,6 +96,7 @@ class Session(SessionState):
         bench: EmbeddedFile | None = None,
         operator: str = "",
         received: str = "",
+        unit: str | None = None,
     ) -> Self:
         """Create a session in a new folder.
 
@@ -100,7 +107,8 @@ class Session(SessionState):
         procedure, site : EmbeddedFile
             Already checked.
         calibration : Path
-            The unit's certificate; the session keeps a copy.
+            The unit's certificate; the session keeps a copy. It need not exist where the sensors are
+            calibrated: an accepted result is written there.
         profile : str
             Name or path of the profile.
         port : str
@@ -111,6 +119,8 @@ class Session(SessionState):
             Who conducts the session.
         received : str
             Date on which the unit was received.
+        unit : str, optional
+            Serial number; required without a certificate.
 
         Returns
         -------
@@ -122,14 +132,21 @@ class Session(SessionState):
             The folder contains a session; or the folder, the certificate or the bench's key cannot be used.
         """
         key = bench_key()
-        before = read_calibration_file(calibration)
+        kind = settings_file.parse_text(procedure.text.encode(), Procedure, procedure.name).kind
+        before = read_calibration_file(calibration) if calibration.exists() or kind == "arms" else None
+        serial = unit if before is None else before.model.serial_number
+        if serial is None:
+            raise InputError(f"expected the unit's serial number (--unit): there is no {calibration} yet")
+        working = working_certificate(
+            kind, None if before is None else before.model, profiles.load(profile), serial
+        )
         plan = Plan(
             format="imu50-session",
             version=1,
             software=f"imu50 {version('imu50')}",
-            unit=before.model.serial_number,
+            unit=serial,
             port=port,
-            certificate=CertificateFile(calibration.resolve(), before.sha256),
+            certificate=CertificateFile(calibration.resolve(), None if before is None else before.sha256),
             procedure=procedure,
             site=site,
             profile=EmbeddedFile.of(profile, profiles.content(profile)),
@@ -148,8 +165,8 @@ class Session(SessionState):
                 raise InputError(
                     f"{folder}: expected a new folder, it contains a session; resume it, or name another"
                 )
-            (folder / INITIAL_CERTIFICATE).write_bytes(before.content)
-            working = before.model.without_size_effect().without_skew()  # both are estimated
+            if before is not None:
+                (folder / INITIAL_CERTIFICATE).write_bytes(before.content)
             write_calibration(folder / WORKING_CERTIFICATE, working)
             journal.begin(folder / JOURNAL, plan)
             return cls(folder, lock, key)
@@ -226,8 +243,15 @@ class Session(SessionState):
             self.record_file(name, left=True)
         return tuple(left)
 
+    def next_recording(self) -> str:
+        """Return the name of the next recording of a session of rests."""
+        numbers = (path.stem.removeprefix("run-") for path in self.folder.glob("run-*"))
+        return f"run-{max((int(n) for n in numbers if n.isdecimal()), default=0) + 1}"
+
     def next_attempt(self, step_id: str) -> int:
         """Return the number of the next attempt at a step; interrupted attempts count."""
+        if not self.procedure().runs:
+            return self.last_attempt(step_id) + 1
         numbers = [path.stem.removeprefix(f"run-{step_id}-") for path in self.folder.glob(f"run-{step_id}-*")]
         return max((int(number) for number in numbers if number.isdecimal()), default=0) + 1
 

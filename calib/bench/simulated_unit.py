@@ -13,23 +13,25 @@ import numpy as np
 
 from calib.bench.technician import (
     BENCH,
+    NEW_UNIT,
     LiveTechnician,
     Mistake,
     mistakes_of,
+    new_unit_scenario,
     technician_scenario,
     true_calibration,
+    true_new_unit,
     unit_scenario,
 )
-from calib.certificate import lever_arms_of
-from calib.lever_arms.gauge import LeverArms
 from calib.procedure.events import View
-from calib.procedure.schema import VERIFICATION, Procedure
+from calib.procedure.schema import VERIFICATION, Kind, Procedure
 from imudrv import profiles
-from imudrv.calibration import write_calibration
+from imudrv.calibration import Calibration, write_calibration
 from imudrv.errors import InputError
 from imudrv.files import settings_file
 from imudrv.loopback import LOOPBACK
 from imudrv.posix import termios
+from imudrv.sim import scenario as scenarios
 from imudrv.sim.scenario import Segment, nominal
 from imudrv.url import speed_of
 from imudrv.wire.layout import Layout
@@ -102,33 +104,36 @@ class SimulatedUnitProcess:
             address = f"{LOOPBACK}:{_free_port()}"
             self.port, self._target = f"socket://{address}", ["--port", f"tcp://{address}"]
 
-    def make(self, layout: Layout) -> tuple[str, Path, Path]:
+    def make(self, layout: Layout, kind: Kind) -> tuple[str, Path, Path]:
         """Write the unit's certificate and site.
 
         Parameters
         ----------
         layout : Layout
             Layout of the profile.
+        kind : {'arms', 'sensors', 'noise'}
+            Kind of the procedure.
 
         Returns
         -------
         str
             Port of the unit.
         Path
-            Its certificate, without lever arms.
+            Its certificate, without lever arms; of a unit whose sensors are to be calibrated there is none.
         Path
             Site of the bench.
         """
         self._folder.mkdir(parents=True, exist_ok=True)
-        unit = true_calibration(SEED, nominal(layout))
         certificate, site = self._folder / "unit.yaml", self._folder / "site.yaml"
-        write_calibration(certificate, unit.model_copy(update={"size_effect": None}))
-        settings_file.write(site, BENCH)
+        unit = self.truth(layout, kind)
+        if kind != "sensors":
+            write_calibration(certificate, unit.model_copy(update={"size_effect": None}))
+        settings_file.write(site, BENCH if kind == "arms" else scenarios.load(NEW_UNIT).site)
         return self.port, certificate, site
 
-    def truth(self, layout: Layout) -> LeverArms:
-        """Return the true lever arms of the unit, to compare the result with at the end."""
-        return lever_arms_of(true_calibration(SEED, nominal(layout)), "the simulated unit")
+    def truth(self, layout: Layout, kind: Kind) -> Calibration:
+        """Return the true unit, to compare the result of a kind of procedure with at the end."""
+        return true_calibration(SEED, nominal(layout)) if kind == "arms" else true_new_unit(nominal(layout))
 
     def begin(self, procedure: Procedure, profile: str) -> None:
         """Start the unit anew and carry out a procedure with it.
@@ -153,8 +158,11 @@ class SimulatedUnitProcess:
             mistakes = mistakes_of(self._mistakes, procedure, np.random.default_rng())
         if self._is_live:
             self._technician = technician = LiveTechnician(procedure, mistakes, SEED, self._move)
-            truth = true_calibration(SEED, sends)
-            scene = unit_scenario(technician.start, technician.begins_with, truth, SEED)
+            if procedure.runs:
+                truth = true_calibration(SEED, sends)
+                scene = unit_scenario(technician.start, technician.begins_with, truth, SEED)
+            else:
+                scene = new_unit_scenario(technician.start, technician.begins_with, sends, SEED)
             port, link = (self._target[1], self._target[3]) if termios is not None else (self._target[1], "")
             command = ["-m", "calib.bench.live_unit", str(scenario), profile, port, link, self._speed]
         else:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Final, NamedTuple, TypeVar
 
 from calib.bench.entries import (
+    AcceptedRest,
     AcceptedStep,
     Decision,
     EmbeddedFile,
@@ -16,9 +17,9 @@ from calib.bench.entries import (
     Signed,
 )
 from calib.identification import PriorCalibration
-from calib.procedure.events import Finished, Redone
+from calib.procedure.events import Entered, Finished, Redone, Rested
 from calib.procedure.plan import verification
-from calib.procedure.schema import VERIFICATION, Procedure, Step
+from calib.procedure.schema import VERIFICATION, Procedure, Run
 from imudrv.bench import Bench
 from imudrv.calibration import read_calibration
 from imudrv.errors import InputError
@@ -49,6 +50,9 @@ REPORTS: Final = {"en": REPORT, "zh_CN": "report.zh_CN.html"}
 PROFILE: Final = "profile.yaml"
 
 
+RECORDING_SUFFIX: Final = ".mcap"
+
+
 LOCK: Final = ".lock"
 
 
@@ -64,7 +68,7 @@ class Attempt(NamedTuple):
 
     Attributes
     ----------
-    step : Step
+    step : Run
         The step.
     recording : Path
         Its recording.
@@ -74,7 +78,7 @@ class Attempt(NamedTuple):
         Number of samples of the attempt; None if unknown, as in sessions of an older version.
     """
 
-    step: Step
+    step: Run
     recording: Path
     first_counter: int
     last_counter: int
@@ -109,7 +113,7 @@ class SessionState:
         self.folder, self.entries, self.plan = folder, entries, plan
         self._procedure = self._parse("procedure", plan.procedure, Procedure)
         self._site = self._parse("site", plan.site, Site)
-        self._parse("profile", plan.profile, Profile)
+        self._profile = self._parse("profile", plan.profile, Profile)
         self._bench = Bench() if plan.bench is None else self._parse("bench", plan.bench, Bench)
 
     @property
@@ -124,11 +128,11 @@ class SessionState:
         return files
 
     @property
-    def accepted(self) -> dict[str, AcceptedStep]:
+    def accepted(self) -> dict[str, AcceptedStep | AcceptedRest]:
         """Accepted steps by their id."""
-        accepted: dict[str, AcceptedStep] = {}
+        accepted: dict[str, AcceptedStep | AcceptedRest] = {}
         for entry in self.entries:
-            if isinstance(entry, AcceptedStep):
+            if isinstance(entry, AcceptedStep | AcceptedRest):
                 accepted[entry.step_id] = entry
             elif isinstance(entry, Redone):
                 accepted.pop(entry.step_id, None)
@@ -164,6 +168,10 @@ class SessionState:
         """Return the procedure of the session."""
         return self._procedure
 
+    def profile_model(self) -> Profile:
+        """Return the wire format of the unit."""
+        return self._profile
+
     def bench(self) -> Bench:
         """Return who calibrates, where and with what."""
         return self._bench
@@ -189,20 +197,65 @@ class SessionState:
         return path
 
     def initial_calibration(self) -> PriorCalibration:
-        """Return the certificate with which the session began."""
+        """Return the certificate with which the session began.
+
+        Raises
+        ------
+        InputError
+            It began without one.
+        """
         certificate = self.plan.certificate
+        if certificate.sha256 is None:
+            raise InputError(
+                f"{self.folder}: expected the certificate before it, the session began without one"
+            )
         return PriorCalibration(
             read_calibration(self.path(INITIAL_CERTIFICATE)), certificate.path.name, certificate.sha256
         )
 
     def attempts(self) -> dict[str, Attempt]:
-        """Return the accepted attempts by step id, in the order of the procedure, the verification last."""
+        """Return the accepted runs by step id, in the order of the procedure, the verification last."""
         procedure, accepted = self.procedure(), self.accepted
+        if not procedure.runs:
+            return {}
         return {
             step.id: Attempt(step, self.path(a.recording), a.first_counter, a.last_counter, a.samples)
-            for step in (*procedure.steps, *verification(procedure).steps)
-            if (a := accepted.get(step.id)) is not None
+            for step in (*procedure.runs, *verification(procedure).runs)
+            if isinstance(a := accepted.get(step.id), AcceptedStep)
         }
+
+    @property
+    def rested_s(self) -> dict[str, float]:
+        """Time at rest of a long rest so far, by step id; nothing once the step is withdrawn."""
+        rested: dict[str, float] = {}
+        for entry in self.entries:
+            if isinstance(entry, Rested):
+                rested[entry.step_id] = entry.rest_s
+            elif isinstance(entry, Redone):
+                rested.pop(entry.step_id, None)
+        return rested
+
+    def last_attempt(self, step_id: str) -> int:
+        """Return the number of the last attempt at a step in the journal, 0 without one."""
+        return max(
+            (
+                entry.attempt
+                for entry in self.entries
+                if isinstance(entry, Entered) and entry.step_id == step_id
+            ),
+            default=0,
+        )
+
+    def recordings(self) -> list[Path]:
+        """Return the recordings of a session of rests, in time; those that contain no rest are left out."""
+        found, has_rest = [], False
+        for entry in self.entries:
+            has_rest = has_rest or isinstance(entry, AcceptedRest | Rested)
+            if isinstance(entry, FileRecorded) and entry.name.endswith(RECORDING_SUFFIX):
+                if has_rest:
+                    found.append(self.path(entry.name))
+                has_rest = False
+        return found
 
     def _parse(self, key: str, file: EmbeddedFile, model: type[M]) -> M:
         return settings_file.parse_text(

@@ -17,14 +17,16 @@ from scipy.spatial.transform import Rotation as Attitude
 from calib.axes import side
 from calib.certificate import sensing_points
 from calib.procedure.events import Phase, View
+from calib.procedure.phases import VERDICT_S
 from calib.procedure.plan import turn_s
 from calib.procedure.preflight import PREFLIGHT_S
 from calib.procedure.prompts import READY_S
-from calib.procedure.schema import Procedure, Step
+from calib.procedure.schema import Procedure, Run, Step
 from imudrv.arrays import Array
-from imudrv.calibration import Calibration, SizeEffect
+from imudrv.calibration import Calibration, SizeEffect, coefficients
 from imudrv.errors import InputError
 from imudrv.nav.attitude import rotation
+from imudrv.sim import scenario as scenarios
 from imudrv.sim.path import start_attitude
 from imudrv.sim.scenario import (
     NOMINAL,
@@ -47,6 +49,14 @@ Kind = Literal["moves", "wrong way", "short", "slow", "wrong pose", "bump", "unp
 
 BENCH: Final = Site(latitude_deg=28.2, longitude_deg=113.0, height_m=60.0)
 """Site of the rehearsal."""
+
+
+NEW_UNIT: Final = "six-faces-turned"
+"""Shipped scenario with the unit of a rehearsal of the sensors and the noise, and its site."""
+
+
+REHEARSED_UNIT: Final = "rehearsal"
+"""Serial number of the unit of a rehearsal."""
 
 
 REACTION_S: Final = 4.0
@@ -76,6 +86,8 @@ ARM_MM: Final = 18.0
 
 MISTAKES: Final[tuple[Kind, ...]] = ("moves", "wrong way", "short", "slow", "wrong pose", "bump")
 """Mistakes to practise with, whoever makes them."""
+MISTAKES_AT_REST: Final[tuple[Kind, ...]] = ("moves", "wrong pose", "bump", "unplug")
+"""The same where the steps are rests."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +99,8 @@ class Mistake:
     step_id : str
         The step.
     kind : str
-        'moves': touches the unit during the alignment. 'wrong way': rotates in the wrong direction first.
+        'moves': touches the unit during the alignment, or during a rest of the sensors. 'wrong way': rotates
+        in the wrong direction first.
         'short': rotates by 150 deg only. 'slow': takes 8 s. 'wrong pose': puts another side up first. 'bump':
         bumps the bench during the rest after the rotation. 'unplug': unplugs the cable for 3 s during the
         alignment. 'short rest': rotates again too early; in a step of several turns.
@@ -122,11 +135,12 @@ def mistakes_of(text: str, procedure: Procedure, rng: np.random.Generator) -> tu
         A mistake is unknown, or there are more than steps.
     """
     steps = [step.id for step in procedure.steps]
+    possible = MISTAKES if procedure.runs else MISTAKES_AT_REST
     if text == "random":
-        kinds = [MISTAKES[k] for k in rng.integers(len(MISTAKES), size=len(steps))]
+        kinds = [possible[k] for k in rng.integers(len(possible), size=len(steps))]
         return tuple(Mistake(s, kind) for s, kind in zip(steps, kinds, strict=True) if rng.random() < 0.75)
     names = text.split(",")
-    known = {kind.replace(" ", "-"): kind for kind in MISTAKES}
+    known = {kind.replace(" ", "-"): kind for kind in possible}
     if unknown := [name for name in names if name not in known]:
         raise InputError(f"--mistakes: expected random, or some of {', '.join(known)}, got {unknown[0]!r}")
     if len(names) > len(steps):
@@ -175,11 +189,14 @@ def technician_scenario(
             f"got {', '.join(m.step_id for m in mistakes)}"
         )
     rng = np.random.default_rng(seed)
-    truth = _draw_lever_arms(rng, unit) if calibration is None else calibration
+    if procedure.runs:
+        truth = _draw_lever_arms(rng, unit) if calibration is None else calibration
     hands = _MotionScript(procedure, rng)
     for step in procedure.steps:
         hands.do(step, by_step.get(step.id))
     hands.rest(REACTION_S)
+    if not procedure.runs:
+        return new_unit_scenario(hands.start, hands.motion, unit, seed, hands.unplugs)
     return unit_scenario(hands.start, hands.motion, truth, seed, hands.unplugs)
 
 
@@ -210,6 +227,45 @@ def unit_scenario(
     )
 
 
+def new_unit_scenario(
+    start: Start, motion: Sequence[Segment], nominal: Calibration, seed: int, unplugs: Sequence[Unplug] = ()
+) -> Scenario:
+    """Return the scenario of a unit that was never calibrated, `true_new_unit`, with some motion."""
+    shipped = scenarios.load(NEW_UNIT)
+    unit = shipped.unit.model_copy(update={"calibration": true_new_unit(nominal)})
+    return shipped.model_copy(
+        update={
+            "seed": seed,
+            "start": start,
+            "motion": tuple(motion),
+            "unit": unit,
+            "faults": Faults(unplugs=tuple(unplugs)),
+        }
+    )
+
+
+def true_new_unit(nominal: Calibration) -> Calibration:
+    """Return the unit of the shipped scenario `NEW_UNIT`, its scales as far off the nominal ones as there."""
+    shipped = scenarios.load(NEW_UNIT).unit.calibration
+    if shipped is None:
+        raise RuntimeError(f"{NEW_UNIT}: a unit without a calibration")
+    truth, at_nominal = coefficients(shipped), coefficients(NOMINAL)
+    gyro = truth.gyro_scale / at_nominal.gyro_scale
+    accelerometer = truth.accelerometer_scale / at_nominal.accelerometer_scale
+    scales = nominal.gyro.scale_arcsec_per_pulse, nominal.accelerometer.scale_pulse_per_m_s
+    names = "scale_arcsec_per_pulse", "scale_pulse_per_m_s"
+    parts = []
+    for own, ratio, scale, name in zip(
+        (shipped.gyro, shipped.accelerometer), (gyro, accelerometer), scales, names, strict=True
+    ):
+        values = tuple((ratio * np.array(scale or (1.0, 1.0, 1.0))).tolist())
+        given = {name: values, "scale": None} if scale else {name: None, "scale": values}
+        parts.append(own.model_copy(update=given))
+    return shipped.model_copy(
+        update={"gyro": parts[0], "accelerometer": parts[1], "serial_number": REHEARSED_UNIT}
+    )
+
+
 def true_calibration(seed: int, unit: Calibration = NOMINAL) -> Calibration:
     """Return a unit with random lever arms, as `technician_scenario` simulates it."""
     return _draw_lever_arms(np.random.default_rng(seed), unit)
@@ -220,7 +276,7 @@ def _draw_lever_arms(rng: np.random.Generator, unit: Calibration) -> Calibration
     r_mm = np.round(rng.normal(0.0, ARM_MM, (3, 3)), 3)
     r_mm[2] = -r_mm[0] - r_mm[1]
     size_effect = SizeEffect(r_mm=sensing_points(np.round(r_mm, 3)), gauge="centroid")
-    return unit.model_copy(update={"serial_number": "rehearsal", "size_effect": size_effect})
+    return unit.model_copy(update={"serial_number": REHEARSED_UNIT, "size_effect": size_effect})
 
 
 class _MotionScript:
@@ -240,6 +296,9 @@ class _MotionScript:
 
     def do(self, step: Step, made: Mistake | None) -> None:
         """Carry out a step, with a mistake."""
+        if not isinstance(step, Run):
+            self._rest_in_pose(step, made.kind if made else None)
+            return
         turn_deg, turn_s = self.by_hand(step.turn_deg)
         mistake = made.kind if made else None
         if mistake == "wrong pose":
@@ -271,7 +330,24 @@ class _MotionScript:
         self.turn(turn_deg, turn_s)
         self.rest(step.rest_s + REACTION_S)
 
-    def _several_turns(self, step: Step, made: Mistake | None) -> None:
+    def _rest_in_pose(self, step: Step, mistake: Kind | None) -> None:
+        """Set the unit down and leave it alone; after a mistake once more."""
+        if mistake == "wrong pose":
+            self.carry(self.wrong_pose(step))
+            self.rest(2.0 * REACTION_S)
+        if not self.is_in_pose(step):
+            self.carry(self.pose(step))
+        if mistake in ("moves", "bump", "unplug"):
+            self.rest(READY_S + 0.5 * step.rest_s)
+            if mistake == "unplug":
+                self.unplugs.append(Unplug(at_s=self._t_s, duration_s=3.0))
+                self.rest(3.0)
+            else:
+                self.turn(*((2.0, 1.0) if mistake == "moves" else (0.5, 0.2)))
+            self.rest(VERDICT_S)
+        self.rest(2.0 * READY_S + step.rest_s + REACTION_S)
+
+    def _several_turns(self, step: Run, made: Mistake | None) -> None:
         """Make the turns of a run, without repeating the one with the mistake."""
         for number in range(1, step.turns + 1):
             turn_deg, turn_s = self.by_hand(step.angle_deg(number))
@@ -300,7 +376,7 @@ class _MotionScript:
         """Leave the unit alone."""
         self._add(Segment(rest=Rest(duration_s=duration_s)), duration_s)
 
-    def _align(self, step: Step) -> None:
+    def _align(self, step: Run) -> None:
         limits = self._procedure.limits
         self.rest(READY_S + limits.still_s + step.align_s + REACTION_S)
 
@@ -405,10 +481,11 @@ class LiveTechnician:
 
     def _act(self, step: Step, view: View) -> None:
         hands, mistake = self._hands, self._mistakes.get(step.id)
+        resting = Phase.ALIGN if isinstance(step, Run) else Phase.REST
         if view.phase is Phase.PLACE and not hands.is_in_pose(step):
             wrong = mistake == "wrong pose" and self._mistakes.pop(step.id)
             hands.carry(hands.wrong_pose(step) if wrong else hands.pose(step))
-        elif view.phase is Phase.ALIGN and mistake == "moves" and (view.progress or 0.0) > 0.3:
+        elif view.phase is resting and mistake == "moves" and (view.progress or 0.0) > 0.3:
             del self._mistakes[step.id]
             hands.turn(2.0, 1.0)
         elif view.phase is Phase.ROTATE and view.want_deg is not None:

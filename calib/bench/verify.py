@@ -11,8 +11,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from calib.bench import journal
+from calib.bench.entries import AcceptedRest, Decision
 from calib.bench.journal import Contents
-from calib.bench.result import decode_covered, identify_session
+from calib.bench.kinds import compute
+from calib.bench.recordings import uncovered_steps
+from calib.bench.result import decode_covered
 from calib.bench.state import (
     INITIAL_CERTIFICATE,
     JOURNAL,
@@ -24,11 +27,20 @@ from calib.bench.state import (
     SessionState,
     require_session,
 )
+from calib.bench.working import working_certificate
 from calib.certificate import PROVENANCE_IDENTIFIED
+from calib.messages import english
+from calib.noise.documents import PROVENANCE_NOISE
 from calib.signing.certificates import signature_fault
 from calib.signing.keys import bench_key
 from calib.signing.signatures import fingerprint, is_valid
-from imudrv.calibration import Calibration, Signature, read_calibration, read_calibration_file
+from imudrv.calibration import (
+    PROVENANCE_SENSORS,
+    Calibration,
+    Signature,
+    read_calibration,
+    read_calibration_file,
+)
 from imudrv.errors import InputError
 from imudrv.files import atomic
 from imudrv.recording.reader import Recording
@@ -144,7 +156,9 @@ def _verify_session(folder: Path, trusted: Mapping[str, str] | None) -> Verified
     notes += [f"{folder / name}: not in the journal, not checked" for name in shown]
     signed = {JOURNAL: contents.signature}
     if not faults and RESULT not in files:
-        if session.is_over:
+        decision = session.stage(Decision)
+        needs_none = not session.procedure().runs and decision is not None and not decision.accepted
+        if session.is_over and not needs_none:
             faults = [f"{folder / RESULT}: expected in the journal of a session at its end, it is not there"]
         notes.append("there is no certificate yet")
     elif not faults:
@@ -204,20 +218,25 @@ def _disagreements(session: SessionState) -> Iterator[str]:
     """Yield where certificates and recordings are not those of the plan."""
     plan, working = session.plan, session.path(WORKING_CERTIFICATE)
     try:
-        before = read_calibration_file(session.path(INITIAL_CERTIFICATE), plan.unit)
-        if before.sha256 != plan.certificate.sha256:
-            yield (
-                f"{session.folder / INITIAL_CERTIFICATE}: expected the certificate of the plan, SHA-256 "
-                f"{plan.certificate.sha256[:12]}..., got {before.sha256[:12]}..."
-            )
-        if read_calibration(working) != before.model.without_size_effect():
+        before = None
+        if plan.certificate.sha256 is not None:
+            file = read_calibration_file(session.path(INITIAL_CERTIFICATE), plan.unit)
+            before = file.model
+            if file.sha256 != plan.certificate.sha256:
+                yield (
+                    f"{session.folder / INITIAL_CERTIFICATE}: expected the certificate of the plan, SHA-256 "
+                    f"{plan.certificate.sha256[:12]}..., got {file.sha256[:12]}..."
+                )
+        kind, profile = session.procedure().kind, session.profile_model()
+        if read_calibration(working) != working_certificate(kind, before, profile, plan.unit):
             yield f"{working}: expected {INITIAL_CERTIFICATE} without size effect, got other values"
         if RESULT in session.files:
             result = read_calibration_file(session.path(RESULT), plan.unit)
             if fault := signature_fault(result, str(session.path(RESULT))):
                 yield fault
-        for attempt in session.attempts().values():
-            yield from _foreign(session, Recording(attempt.recording))
+        attempts = [attempt.recording for attempt in session.attempts().values()]
+        for recording in attempts or session.recordings():
+            yield from _foreign(session, Recording(recording))
     except InputError as error:
         yield str(error)
 
@@ -242,6 +261,12 @@ def _uncovered_steps(session: SessionState) -> list[str]:
             decode_covered(attempt)
         except InputError as error:
             faults.append(str(error))
+    recordings = {a.recording for a in session.accepted.values() if isinstance(a, AcceptedRest)}
+    for name in sorted(recordings):
+        faults += [
+            f"{session.folder / name}: step {step}: {english(why)}"
+            for step, why in uncovered_steps(session, name)
+        ]
     return faults
 
 
@@ -249,9 +274,11 @@ def _certificate_faults(session: SessionState) -> list[str]:
     path = session.path(RESULT)
     stored = read_calibration(path)
     try:
-        again = identify_session(session).certificate
+        again = compute(session).certificate
     except InputError as error:
         return [f"{session.folder}: the recordings give no certificate: {error}"]
+    if again is None:
+        return [f"{session.folder}: the recordings give no certificate"]
     if _timeless(again) == _timeless(stored):
         return []
     return [f"{path}: differs from the result of the recordings{_difference(again, stored)}"]
@@ -260,9 +287,10 @@ def _certificate_faults(session: SessionState) -> list[str]:
 def _timeless(calibration: Calibration) -> dict[str, Any]:
     """Return a certificate without the time and software version of its computation."""
     document = calibration.model_dump(mode="json", exclude={"created"})
-    how = (document["provenance"] or {}).get(PROVENANCE_IDENTIFIED)
-    if isinstance(how, dict):
-        how.pop("software", None)
+    for part in (PROVENANCE_IDENTIFIED, PROVENANCE_SENSORS, PROVENANCE_NOISE):
+        how = (document["provenance"] or {}).get(part)
+        if isinstance(how, dict):
+            how.pop("software", None)
     return document
 
 

@@ -11,20 +11,15 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, Final
 
-import numpy as np
-
 from calib.bench.keys import QUESTIONS, action_of
-from calib.bench.result import Result
+from calib.bench.kinds import SessionResult
 from calib.bench.screen import PHASES, large_text, shown_last_try, shown_reasons, tone
 from calib.bench.session import Session
 from calib.bench.simulated_unit import is_rehearsal
 from calib.bench.state import REPORTS, WEB_TOKEN
 from calib.messages import LANGUAGES, Message, catalogue, text
 from calib.procedure.events import Action, View
-from calib.procedure.plan import verification
-from calib.reports.verdict import verdict
-from imudrv.arrays import Array
-from imudrv.units import MM
+from calib.procedure.plan import all_steps
 from imudrv.web.server import PageServer
 
 ADDRESS: Final = "127.0.0.1:8650"
@@ -72,8 +67,7 @@ class WebConsole:
         self.url = self._server.url
         procedure = session.procedure()
         steps = [
-            {"id": step.id, "up": step.up, "wanted": step.C_bn.T.tolist()}
-            for step in (*procedure.steps, *verification(procedure).steps)
+            {"id": step.id, "up": step.up, "wanted": step.C_bn.T.tolist()} for step in all_steps(procedure)
         ]
         self._keep(
             "hello",
@@ -113,20 +107,12 @@ class WebConsole:
                 return accepted
         return None
 
-    def ask(self, result: Result) -> None:
+    def ask(self, result: SessionResult) -> None:
         """Show the result, and ask whether it is accepted."""
         while self._next() is not None:
             pass  # what was pressed before the question is no answer to it
-        arms = result.identification.arms
-        self._keep(
-            "result",
-            {
-                "r_mm": (arms.r_b / MM).tolist(),
-                "u_mm": None if arms.covariance is None else _sigma_mm(arms.covariance),
-                "gauge": arms.gauge,
-                "verdicts": [(mark, _texts(why)) for mark, why in verdict(result.identification)],
-            },
-        )
+        verdicts = [(mark, _texts(why)) for mark, why in result.verdicts]
+        self._keep("result", {**result.page, "verdicts": verdicts})
 
     def decided(self) -> None:
         """Take the question away."""
@@ -191,11 +177,6 @@ def _frame(view: View) -> dict[str, Any]:
         "actions": view.actions,
         "bells": view.bells,
     }
-
-
-def _sigma_mm(covariance: Array) -> list[list[float]]:
-    sigma: list[list[float]] = (np.sqrt(np.diag(covariance)).reshape(3, 3) / MM).tolist()
-    return sigma
 
 
 def _token(path: Path) -> str:

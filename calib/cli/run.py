@@ -7,7 +7,7 @@ from typing import Final
 
 from calib.bench.run import RunOptions, new_folder
 from calib.bench.run import run as run_session
-from calib.bench.technician import MISTAKES
+from calib.bench.technician import MISTAKES, MISTAKES_AT_REST
 from calib.bench.web_console import ADDRESS
 from calib.procedure import plan
 from imudrv.cli.arguments import add_profile
@@ -23,7 +23,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--port", metavar="URL", help="port of the unit, as for imudrv run")
     add_profile(parser)
-    text = "certificate of the unit; replaced when you accept the new one"
+    text = (
+        "certificate of the unit; replaced when you accept the new one; of the sensors it need not exist yet"
+    )
     add("--calibration", type=Path, metavar="C.yaml", help=text)
     add("--site", type=Path, metavar="S.yaml", help="site of the bench: latitude, longitude, height")
     text = "who calibrates, where and with what, for the certificate; default: ~/.config/imu50/bench.yaml"
@@ -60,7 +62,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--web", nargs="?", const=ADDRESS, metavar="HOST:PORT", help=text)
     text = "in a rehearsal: you press the keys, and the technician does what the screen says"
     add("--keys", action="store_true", help=text)
-    text = f"in a rehearsal: random, or some of {', '.join(k.replace(' ', '-') for k in MISTAKES)}, by commas"
+    mistakes = ", ".join(kind.replace(" ", "-") for kind in dict.fromkeys((*MISTAKES, *MISTAKES_AT_REST)))
+    text = f"in a rehearsal: random, or some of {mistakes}, by commas"
     add("--mistakes", default="", metavar="LIST", help=text)
     add("--speed", default="1", metavar="X", help="speed of the rehearsal: 1, 10, ... or max")
 

@@ -14,13 +14,26 @@ from calib.axes import axis_name
 from calib.detection.blocks import BLOCK_NS, Block
 from calib.messages import Message, message
 from imudrv.arrays import Array
-from imudrv.nav.attitude import Quaternion, conjugate, product, quaternion_of_vector, rows_of, turn, unit
+from imudrv.nav.attitude import (
+    Quaternion,
+    conjugate,
+    product,
+    quaternion_of_matrix,
+    quaternion_of_vector,
+    rows_of,
+    turn,
+    unit,
+)
 from imudrv.nav.earth import earth_rate_n
-from imudrv.units import DEG, NS, STANDARD_GRAVITY
+from imudrv.units import DEG, DEG_PER_H, NS, STANDARD_GRAVITY
 from imudrv.vectors import Vector, add, cross, dot, scale, subtract
 
 SMOOTH_S: Final = 0.2
 """Time constant of the smoothed gravity while the unit is carried, s."""
+
+
+LEAST_HORIZONTAL_RATE: Final = 3.0 * DEG_PER_H
+"""Smallest horizontal rate at rest that shows a heading, rad/s: more than the bias of a new gyro."""
 
 
 MG: Final = 1e-3 * STANDARD_GRAVITY
@@ -144,6 +157,27 @@ class AttitudeTracker:
         elif self.q_nb is not None:
             earth = quaternion_of_vector(scale(-block.seconds, self._earth_n))
             self.q_nb = unit(product(earth, product(self.q_nb, quaternion_of_vector(block.dtheta))))
+
+    def align(self, rate: Array, force: Array) -> None:
+        """Set the attitude from the mean rate, rad/s, and force, m/s^2, of a rest.
+
+        The rate is that of the Earth but for the biases of the gyros; where it has no horizontal part to
+        speak of, there is no heading.
+        """
+        up = force / np.linalg.norm(force)
+        east = np.cross(rate, up)
+        if (size := float(np.linalg.norm(east))) < LEAST_HORIZONTAL_RATE:
+            self.q_nb = None
+            return
+        C_nb = np.stack([east / size, np.cross(up, east / size), up])
+        w, x, y, z = quaternion_of_matrix(C_nb).tolist()
+        self.q_nb = w, x, y, z
+
+    def turned_from(self, before: Quaternion | None) -> float | None:
+        """Return the angle from an earlier attitude, rad; None: one of them is not known."""
+        if before is None or self.q_nb is None:
+            return None
+        return 2.0 * acos(min(1.0, abs(product(conjugate(before), self.q_nb)[0])))
 
     @property
     def up(self) -> str:

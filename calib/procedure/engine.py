@@ -25,7 +25,7 @@ from math import hypot
 from calib.axes import vector
 from calib.detection.blocks import Block, BlockSplitter
 from calib.detection.tracking import MG, AttitudeTracker, StillnessDetector
-from calib.messages import Message, message
+from calib.messages import Message
 from calib.procedure.events import (
     Abort,
     Aborted,
@@ -40,17 +40,17 @@ from calib.procedure.events import (
     Phase,
     Redo,
     Redone,
+    RestAccepted,
     Skipped,
     View,
 )
-from calib.procedure.phases import STATES, motion_limits
-from calib.procedure.plan import predicted
+from calib.procedure.kinds import KINDS
+from calib.procedure.phases import Placing, motion_limits
 from calib.procedure.progress import Progress
 from calib.procedure.prompts import title
 from calib.procedure.schema import Procedure
-from calib.procedure.transitions import NEW_ATTEMPT, TRANSITIONS, Outcome
+from calib.procedure.transitions import NEW_ATTEMPT, Outcome
 from imudrv.calibration import Calibration
-from imudrv.errors import InputError
 from imudrv.records import Records
 from imudrv.site import Site
 from imudrv.units import DEG, NS
@@ -75,6 +75,8 @@ class Engine:
         Steps that an earlier session has accepted, by id.
     attempts : mapping of str to int
         Number of the last attempt of each step in an earlier session; the next one is one more.
+    rested_s : mapping of str to float
+        Time at rest of long rests that an earlier session has not completed, by id.
     """
 
     def __init__(
@@ -85,10 +87,12 @@ class Engine:
         *,
         interval_ns: int,
         hands_free: bool = False,
-        accepted: Mapping[str, Accepted] | None = None,
+        accepted: Mapping[str, Accepted | RestAccepted] | None = None,
         attempts: Mapping[str, int] | None = None,
+        rested_s: Mapping[str, float] | None = None,
     ) -> None:
         limits = procedure.limits
+        self._kind = KINDS[procedure.kind]
         self._splitter = BlockSplitter(interval_ns)
         self._progress = Progress(
             procedure,
@@ -101,6 +105,7 @@ class Engine:
             StillnessDetector(*motion_limits(3.0 * limits.noise_deg_per_s * DEG, 3.0 * limits.noise_mg * MG)),
             dict(accepted or {}),
             dict(attempts or {}),
+            rested_s=dict(rested_s or {}),
         )
         index = self._progress.remaining()
         self._progress.index = len(procedure.steps) - 1 if index is None else index
@@ -141,8 +146,8 @@ class Engine:
             elif self._is_rejected:
                 p.move_on()
                 self._follow(Outcome.AGAIN)
-            elif self._has(Outcome.PLACED) and p.observation.ready:
-                self._follow(Outcome.PLACED)
+            elif isinstance(self._state, Placing) and p.observation.ready:
+                self._follow(self._state.placed())
         return self._new_events()
 
     def reject(self, step_id: str, reason: Message) -> tuple[Event, ...]:
@@ -199,8 +204,8 @@ class Engine:
         )
 
     @property
-    def accepted(self) -> Mapping[str, Accepted]:
-        """Accepted run of each step, by id, in the order of the steps."""
+    def accepted(self) -> Mapping[str, Accepted | RestAccepted]:
+        """Accepted run or rest of each step, by id, in the order of the steps."""
         steps, accepted = self._progress.procedure.steps, self._progress.accepted
         return {s.id: accepted[s.id] for s in steps if s.id in accepted}
 
@@ -213,18 +218,18 @@ class Engine:
 
     def _has(self, outcome: Outcome) -> bool:
         """Whether an outcome has an effect in the current phase."""
-        return (self._phase, outcome) in TRANSITIONS
+        return (self._phase, outcome) in self._kind.transitions
 
     def _follow(self, outcome: Outcome) -> None:
         p = self._progress
         if outcome in NEW_ATTEMPT:
             p.attempts[p.step.id] = p.number + 1
-        self._enter(TRANSITIONS[self._phase, outcome])
+        self._enter(self._kind.transitions[self._phase, outcome])
 
     def _enter(self, phase: Phase) -> None:
         p = self._progress
         p.elapsed_s = 0.0
-        self._phase, self._state = phase, STATES[phase](p)
+        self._phase, self._state = phase, self._kind.states[phase](p)
         p.events.append(Entered(phase, self._state.step_id, self._state.number, p.counter))
         if phase is Phase.DONE:
             self._finish()
@@ -235,6 +240,7 @@ class Engine:
         p.elapsed_s += block.seconds
         p.stillness.feed(block)
         p.attitude.feed(block)
+        p.carried.feed(block)
         outcome = self._state.feed(block)
         if outcome is not None:
             self._follow(outcome)
@@ -244,11 +250,8 @@ class Engine:
         accepted = tuple(self.accepted)
         skipped = tuple(step.id for step in p.procedure.steps if step.id not in accepted)
         p.reasons = ()
-        if skipped:
-            try:
-                predicted(p.procedure, p.site, skipped=skipped)
-            except InputError:
-                p.reasons = (message("too_few_steps", steps=skipped),)
+        if skipped and (reason := self._kind.too_few(p.procedure, p.site, skipped)):
+            p.reasons = (reason,)
         p.bells += 1
         p.events.append(Finished(accepted, skipped, p.reasons, p.counter))
 

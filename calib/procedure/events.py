@@ -192,6 +192,53 @@ class Accepted:
 
 
 @dataclass(frozen=True)
+class Rested:
+    """A long rest of the noise goes on; it counts in another session, too.
+
+    Attributes
+    ----------
+    rest_s : float
+        Time at rest so far.
+    """
+
+    step_id: str
+    attempt: int
+    rest_s: float
+    counter: int
+
+
+@dataclass(frozen=True)
+class RestAccepted:
+    """A rest of a procedure of the sensors or the noise is accepted.
+
+    Attributes
+    ----------
+    first_counter, last_counter : int
+        First and last sample of the rest.
+    samples : int
+        Number of samples between them that arrived.
+    rest_s : float
+        Time at rest.
+    lean_deg : float
+        Angle between the axis that is to be up and the vertical.
+    heading_deg : float or None
+        Clockwise deviation from the heading of the pose, by the Earth's rotation; None: not known.
+    missing : int
+        Number of samples lost while the unit was carried to this pose.
+    """
+
+    step_id: str
+    attempt: int
+    first_counter: int
+    last_counter: int
+    samples: int
+    rest_s: float
+    lean_deg: float
+    heading_deg: float | None
+    missing: int = 0
+
+
+@dataclass(frozen=True)
 class Rejected:
     """An attempt, or the preflight (`step_id` is `PREFLIGHT`), is rejected.
 
@@ -250,7 +297,18 @@ class Aborted:
 
 
 Event: TypeAlias = (
-    Entered | Checked | Restarted | Turned | Accepted | Rejected | Skipped | Redone | Finished | Aborted
+    Entered
+    | Checked
+    | Restarted
+    | Turned
+    | Rested
+    | Accepted
+    | RestAccepted
+    | Rejected
+    | Skipped
+    | Redone
+    | Finished
+    | Aborted
 )
 
 

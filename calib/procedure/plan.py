@@ -61,7 +61,7 @@ def predicted(procedure: Procedure, site: Site, skipped: Collection[str] = ()) -
             turns=step.turns,
             alternate=step.alternate,
         )
-        for step in procedure.steps
+        for step in procedure.runs
         if step.id not in skipped
     ]
     try:
@@ -78,12 +78,14 @@ def turn_s(procedure: Procedure) -> float:
 
 def duration_s(procedure: Procedure) -> float:
     """Return how long a procedure takes in practised hands, s."""
+    if not procedure.runs:
+        return PREFLIGHT_S + sum(HANDLING_S + step.rest_s for step in procedure.steps)
     return PREFLIGHT_S + sum(
         HANDLING_S
         + procedure.limits.still_s
         + step.align_s
         + step.turns * (REACTION_S + turn_s(procedure) + step.rest_s)
-        for step in procedure.steps
+        for step in procedure.runs
     )
 
 
@@ -91,12 +93,12 @@ def text(procedure: Procedure, site: Site) -> str:
     """Return a plan as text: its steps, how long it takes, and its predicted accuracy; see `predicted`."""
     prediction = predicted(procedure, site)
     shortest, longest = procedure.turn_s
-    rotations = sum(step.turns for step in procedure.steps)
+    rotations = sum(step.turns for step in procedure.runs)
     lines = [f"{procedure.name}: {rotations} rotations, about {duration_s(procedure) / 60.0:.0f} min"]
     lines += [
         f"  {step.id}: {side(step.up)} up, {side(step.east)} east; alignment of {step.align_s:g} s, then "
         f"{step.turns} x 180 deg in {shortest:g} to {longest:g} s with a rest of {step.rest_s:g} s"
-        for step in procedure.steps
+        for step in procedure.runs
     ]
     lines.append("expected accuracy (1 sigma), mm       X       Y       Z")
     for name, sigma in zip(("r_x - r_y", "r_x - r_z"), prediction.differences_sigma / MM, strict=True):
@@ -123,9 +125,14 @@ def steps_left(procedure: Procedure, done: Collection[str]) -> Procedure:
 
 def verification(procedure: Procedure) -> Procedure:
     """Return a procedure of one more rotation, `VERIFICATION`, from the pose in which the last one ended."""
-    last = procedure.steps[-1]
+    last = procedure.runs[-1]
     east = opposite(last.east) if last.turns % 2 else last.east
     return _with_steps(procedure, [replace(last, id=VERIFICATION, east=east, turns=1)])
+
+
+def all_steps(procedure: Procedure) -> tuple[Step, ...]:
+    """Return the steps of a procedure, and for the arms that of its `verification`."""
+    return (*procedure.steps, *(verification(procedure).steps if procedure.runs else ()))
 
 
 def _with_steps(procedure: Procedure, steps: Sequence[Step]) -> Procedure:

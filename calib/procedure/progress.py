@@ -6,14 +6,57 @@ from calib.detection.blocks import Block
 from calib.detection.tracking import AttitudeTracker, StillnessDetector
 from calib.messages import Message, message
 from calib.procedure.attempt import Attempt
-from calib.procedure.events import Accepted, Conditions, Event, NavigationLog, Rejected, Restarted
+from calib.procedure.events import (
+    Accepted,
+    Conditions,
+    Event,
+    NavigationLog,
+    Rejected,
+    RestAccepted,
+    Restarted,
+)
 from calib.procedure.prompts import StepObservation
-from calib.procedure.schema import Procedure, Step
+from calib.procedure.schema import Procedure, Run, Step
 from calib.procedure.transitions import Outcome
 from imudrv.calibration import Calibration
 from imudrv.nav.attitude import Quaternion, conjugate, turn
 from imudrv.nav.mechanisation import Navigator
 from imudrv.site import Site
+from imudrv.vectors import Vector, add
+
+
+@dataclass
+class Carried:
+    """The motion since the last accepted rest, by the gyros as they are.
+
+    Attributes
+    ----------
+    since : Quaternion or None
+        Attitude in that rest; None: not known.
+    is_from_rest : bool
+        Whether there was one.
+    turned : Vector
+        Sums of the angle increments, body axes, rad.
+    missing : int
+        Number of samples lost.
+    """
+
+    since: Quaternion | None = None
+    is_from_rest: bool = False
+    turned: Vector = (0.0, 0.0, 0.0)
+    missing: int = 0
+
+    def feed(self, block: Block) -> None:
+        """Follow a block."""
+        self.turned = add(self.turned, block.dtheta)
+        self.missing += block.missing
+        if block.restarted:
+            self.is_from_rest = False
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether `turned` is the whole motion from rest to rest."""
+        return self.is_from_rest and not self.missing
 
 
 @dataclass
@@ -26,7 +69,7 @@ class Progress:
         See `calib.procedure.engine.Engine`.
     attitude, stillness
         Trackers, fed with every block.
-    accepted : dict of str to Accepted
+    accepted : dict of str to Accepted or RestAccepted
         Accepted steps, by id.
     attempts : dict of str to int
         Number of the latest attempt, by step id.
@@ -52,6 +95,10 @@ class Progress:
         Of the newest block.
     elapsed_s : float
         Time in the current phase.
+    carried : Carried
+        The motion since the last accepted rest.
+    rested_s : dict of str to float
+        Time at rest of long rests that are not complete, by step id.
     """
 
     procedure: Procedure
@@ -61,7 +108,7 @@ class Progress:
     hands_free: bool
     attitude: AttitudeTracker
     stillness: StillnessDetector
-    accepted: dict[str, Accepted]
+    accepted: dict[str, Accepted | RestAccepted]
     attempts: dict[str, int]
     index: int = 0
     attempt: Attempt = field(default_factory=Attempt)
@@ -75,11 +122,18 @@ class Progress:
     flags: int = 0
     counter: int = -1
     elapsed_s: float = 0.0
+    carried: Carried = field(default_factory=Carried)
+    rested_s: dict[str, float] = field(default_factory=dict)
 
     @property
     def step(self) -> Step:
         """Current step."""
         return self.procedure.steps[self.index]
+
+    @property
+    def run(self) -> Run:
+        """Current step of a procedure of the arms."""
+        return self.procedure.runs[self.index]
 
     @property
     def number(self) -> int:
@@ -89,14 +143,24 @@ class Progress:
     @property
     def turn_deg(self) -> int:
         """Required angle of the current rotation."""
-        return self.step.angle_deg(self.attempt.number)
+        return self.run.angle_deg(self.attempt.number)
 
     @property
     def observation(self) -> StepObservation:
         """Sensors against the current step."""
+        return self.observe(self.step)
+
+    def observe(self, step: Step) -> StepObservation:
+        """Return the sensors against a step."""
         return StepObservation(
-            self.step, self.procedure.limits, self.attitude, self.stillness, self.flags, self.status.faults
+            step, self.procedure.limits, self.attitude, self.stillness, self.flags, self.status.faults
         )
+
+    @property
+    def following(self) -> Step | None:
+        """First step after the current one that is neither accepted nor skipped."""
+        done = self.accepted.keys() | set(self.skipped) | {self.step.id}
+        return next((step for step in self.procedure.steps if step.id not in done), None)
 
     def remaining(self) -> int | None:
         """Index of the first step that is neither accepted nor skipped."""

@@ -7,8 +7,8 @@ from typing import Final, NamedTuple
 from calib.axes import axis_name, opposite, side, vector
 from calib.detection.tracking import AttitudeTracker, RotationTracker, StillnessDetector
 from calib.messages import Message, message
-from calib.procedure.events import Accepted
-from calib.procedure.schema import Procedure, ProcedureLimits, Step
+from calib.procedure.events import Accepted, RestAccepted
+from calib.procedure.schema import PlannedTurn, Procedure, ProcedureLimits, Run, Step
 from imudrv.records import Flag
 from imudrv.units import DEG
 
@@ -123,6 +123,8 @@ def pose_message(step: Step) -> Message:
 def title(step: Step, number: int, steps: int, turn: int) -> Message:
     """Return the title of step `number` of `steps`, at one of its turns."""
     up = side(step.up)
+    if not isinstance(step, Run):
+        return message("title_rest", step=number, steps=steps, id=step.id, side=up)
     if step.turns > 1:
         return message("title_turns", step=number, steps=steps, side=up, turn=turn, turns=step.turns)
     return message("title", step=number, steps=steps, side=up, turn_deg=step.turn_deg)
@@ -210,19 +212,19 @@ def rotate(
     return Prompt(message("rotate", turn_deg=turn_deg), (instruction,))
 
 
-def rejection(step: Step, procedure: Procedure, reasons: tuple[Message, ...]) -> Prompt:
+def rejection(run: Run, procedure: Procedure, reasons: tuple[Message, ...]) -> Prompt:
     """Prompt after a rejection: the remedy for the first reason."""
     shortest_s, longest_s = procedure.turn_s
-    angle_deg = abs(step.turn_deg)
+    angle_deg = abs(run.turn_deg)
     remedies = {
-        "wrong_direction": message("remedy_direction", turn=turn_message(step.turn_deg * DEG)),
+        "wrong_direction": message("remedy_direction", turn=turn_message(run.turn_deg * DEG)),
         "wrong_angle": message("remedy_angle", angle_deg=angle_deg),
         "too_slow": message("remedy_time", shortest_s=shortest_s, longest_s=longest_s),
         "too_slow_with_error": message("remedy_time", shortest_s=shortest_s, longest_s=longest_s),
         "saturated": message("remedy_time", shortest_s=shortest_s, longest_s=longest_s),
-        "axis_tilted": message("remedy_axis", side=side(step.up)),
-        "wrong_vertical": message("remedy_axis", side=side(step.up)),
-        "left_pose": message("remedy_axis", side=side(step.up)),
+        "axis_tilted": message("remedy_axis", side=side(run.up)),
+        "wrong_vertical": message("remedy_axis", side=side(run.up)),
+        "left_pose": message("remedy_axis", side=side(run.up)),
         "rest_interrupted": message("remedy_rest"),
         "no_rest_before": message("remedy_rest"),
         "no_rest_after": message("remedy_rest"),
@@ -237,9 +239,49 @@ def rejection(step: Step, procedure: Procedure, reasons: tuple[Message, ...]) ->
     return Prompt(message("rejected"), (remedies.get(first, message("remedy_again")),))
 
 
-def verdict(number: int, steps: int, accepted: Accepted) -> Prompt:
+def rest(step: Step, following: Step | None) -> Prompt:
+    """Prompt for a rest, and for the pose after it."""
+    hints = [message("do_not_touch")]
+    if following is not None:
+        hints.append(message("next_pose", id=following.id, pose=pose_message(following)))
+    return Prompt(message("hands_off"), tuple(hints))
+
+
+def turn_of_table(turn: PlannedTurn) -> Message:
+    """Return how a turntable comes to a pose."""
+    return message("turn_table", turn_deg=turn.deg, about=side(turn.about), seconds=turn.seconds)
+
+
+def heading_message(observed: StepObservation) -> Message:
+    """Return how far the heading is off, and the turn that corrects it."""
+    clockwise = observed.clockwise or 0.0
+    return message(
+        "heading_off",
+        side=side(observed.step.east),
+        angle_deg=abs(clockwise) / DEG,
+        limit_deg=observed.limits.heading_deg,
+        turn=turn_message(clockwise),
+    )
+
+
+def rest_rejection(step: Step, reasons: tuple[Message, ...]) -> Prompt:
+    """Prompt after the rejection of a rest: the remedy for the first reason."""
+    remedies = {
+        "rest_interrupted": message("remedy_leave_alone"),
+        "rest_drifts": message("remedy_firm"),
+        "heading_off": message("remedy_pose", pose=pose_message(step)),
+        "turn_differs": message("remedy_table"),
+        "recording_lacks": message("remedy_computer"),
+    }
+    first = reasons[0].key if reasons else ""
+    return Prompt(message("rejected"), (remedies.get(first, message("remedy_again")),))
+
+
+def verdict(number: int, steps: int, accepted: Accepted | RestAccepted) -> Prompt:
     """Verdict on an accepted attempt."""
-    if accepted.turns > 1:
+    if isinstance(accepted, RestAccepted):
+        hint = message("accepted_rest", rest_s=accepted.rest_s, lean_deg=accepted.lean_deg)
+    elif accepted.turns > 1:
         hint = message("accepted_turns", turns=accepted.turns, within=accepted.turns_within_limits)
     else:
         hint = message(
@@ -253,18 +295,11 @@ def verdict(number: int, steps: int, accepted: Accepted) -> Prompt:
 
 def _turn_to_heading(observed: StepObservation, clockwise: float) -> Prompt:
     angle_deg = abs(clockwise) / DEG
-    hint = message(
-        "heading_off",
-        side=side(observed.step.east),
-        angle_deg=angle_deg,
-        limit_deg=observed.limits.heading_deg,
-        turn=turn_message(clockwise),
-    )
     if clockwise > 0.0:
         headline = message("turn_counter_clockwise", angle_deg=angle_deg)
     else:
         headline = message("turn_clockwise", angle_deg=angle_deg)
-    return Prompt(headline, (hint, pose_message(observed.step)))
+    return Prompt(headline, (heading_message(observed), pose_message(observed.step)))
 
 
 def _off_axis(observed: StepObservation, rotation: RotationTracker) -> Message:

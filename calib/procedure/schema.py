@@ -1,14 +1,14 @@
 """Schema of a procedure file: poses, rotations, rests and limits.
 
-A file lists poses; `Procedure.steps` are its runs in order, each with one alignment. A pose with `repeats`
-gives several; one with `turns` gives one run of several rotations with a rest, the *arrest*, after each. The
-id of a step never changes, so that a journal, a key and a recording can name it.
+A file lists poses; `Procedure.steps` are what is done in them: runs, each with one alignment. A pose with
+`repeats` gives several; one with `turns` gives one run of several rotations with a rest, the *arrest*, after
+each. The id of a step never changes, so that a journal, a key and a recording can name it.
 
 `calib.procedure.plan.predicted` gives the accuracy of a plan in advance, and refuses one from which the six
 differences are not observable.
 
-A procedure of the sensors, or of the noise, has rests instead of runs: `Procedure.rests`, one in each pose
-and, with `turn_deg`, another one after a turn in place.
+A procedure of the sensors, or of the noise, has rests instead of runs: one in each pose and, with `turn_deg`,
+another one after a turn in place.
 """
 
 from collections import Counter
@@ -121,30 +121,48 @@ class Pose(Model):
 
 @dataclass(frozen=True)
 class Step:
-    """One run of the procedure: an alignment, and one or more rotations.
+    """One step of a procedure, of any kind: a pose, and what is done in it.
 
     Attributes
     ----------
     id : str
-        Id of the pose; with repeats ``ID-1``, ``ID-2``, ...
+        Id of the pose; with repeats ``ID-1``, ``ID-2``, ...; of the rest after a turn in place ``ID-turned``.
     up, east : str
-        Body axes that point up and about east before the first rotation.
+        Body axes that point up and about east at its beginning.
+    rest_s : float
+        Length of its rest, after each rotation if there are any.
+    """
+
+    id: str
+    up: Side
+    east: Side
+    rest_s: float
+
+    @property
+    def C_bn(self) -> Array:
+        """East, north and up of the pose as columns in body axes, shape (3, 3)."""
+        z, x = vector(self.up), vector(self.east)
+        return np.stack([x, np.cross(z, x), z], axis=1)
+
+
+@dataclass(frozen=True)
+class Run(Step):
+    """One run of a procedure of the arms: an alignment, and one or more rotations.
+
+    Attributes
+    ----------
     turn_deg : int
         The first rotation: +180 or -180, right-handed about up.
-    align_s, rest_s : float
-        Length of the alignment, and of the rest after each rotation.
+    align_s : float
+        Length of the alignment.
     turns : int
         Number of rotations.
     alternate : bool
         Whether every second rotation is back.
     """
 
-    id: str
-    up: Side
-    east: Side
     turn_deg: int
     align_s: float
-    rest_s: float
     turns: int = 1
     alternate: bool = True
 
@@ -152,43 +170,18 @@ class Step:
         """Return the angle of a turn, numbered from 1: +180 or -180, right-handed about up."""
         return -self.turn_deg if self.alternate and turn % 2 == 0 else self.turn_deg
 
-    @property
-    def C_bn(self) -> Array:
-        """East, north and up of the pose as columns in body axes, shape (3, 3)."""
-        return _C_bn(self.up, self.east)
-
 
 @dataclass(frozen=True)
-class PlannedRest:
+class PlannedRest(Step):
     """One rest of a procedure of the sensors or of the noise.
 
     Attributes
     ----------
-    id : str
-        Id of the pose; of the rest after the turn in place ``ID-turned``.
-    up, east : str
-        Body axes that point up and about east.
-    rest_s : float
-        Its length.
     turn : PlannedTurn or None
         How a turntable comes there.
     """
 
-    id: str
-    up: Side
-    east: Side
-    rest_s: float
     turn: PlannedTurn | None = None
-
-    @property
-    def C_bn(self) -> Array:
-        """East, north and up of the pose as columns in body axes, shape (3, 3)."""
-        return _C_bn(self.up, self.east)
-
-
-def _C_bn(up: Side, east: Side) -> Array:
-    z, x = vector(up), vector(east)
-    return np.stack([x, np.cross(z, x), z], axis=1)
 
 
 class Procedure(Model):
@@ -246,24 +239,29 @@ class Procedure(Model):
 
     @model_validator(mode="after")
     def _each_id_once(self) -> Self:
-        counts = Counter(step.id for step in self.steps or self.rests)
+        counts = Counter(step.id for step in self.steps)
         if twice := [name for name, count in counts.items() if count > 1]:
             raise ValueError(f"poses: expected each id once, got {', '.join(twice)} again; rename them")
         return self
 
     @property
     def steps(self) -> tuple[Step, ...]:
+        """What is done, in order: `runs` or `rests`."""
+        return self.runs or self.rests
+
+    @property
+    def runs(self) -> tuple[Run, ...]:
         """Runs in order; none where the kind is another one than arms."""
         if self.kind != "arms":
             return ()
         return tuple(
-            Step(
+            Run(
                 pose.id if pose.repeats == 1 else f"{pose.id}-{k + 1}",
                 pose.up,
                 opposite(pose.east) if k % 2 else pose.east,
+                pose.rest_s or self.rest_s,
                 pose.turn_deg or 180,
                 pose.align_s or self.align_s,
-                pose.rest_s or self.rest_s,
                 pose.turns,
                 pose.alternate,
             )
@@ -284,15 +282,15 @@ class Procedure(Model):
                 rests.append(replace(first, id=f"{pose.id}-turned", east=opposite(pose.east), turn=None))
         return tuple(rests)
 
-    def rotation_limits(self, step: Step) -> acceptance.RotationLimits:
-        """Return the limits of the rotations of a step, for `rejection_reasons` and `navigate_rotations`.
+    def rotation_limits(self, run: Run) -> acceptance.RotationLimits:
+        """Return the limits of the rotations of a run, for `rejection_reasons` and `navigate_rotations`.
 
         An arrest between turns counts even if it was cut short.
 
         Parameters
         ----------
-        step : Step
-            One of `steps`.
+        run : Run
+            One of `runs`.
 
         Returns
         -------
@@ -300,10 +298,10 @@ class Procedure(Model):
         """
         limits = self.limits
         return acceptance.RotationLimits(
-            angle_deg=abs(step.turn_deg),
+            angle_deg=abs(run.turn_deg),
             angle_tolerance_deg=limits.angle_tolerance_deg,
             least_peak_deg_per_s=limits.least_peak_deg_per_s,
             axis_tilt_deg=limits.axis_tilt_deg,
-            rest_before_s=step.align_s,
-            rest_after_s=step.rest_s if step.turns == 1 else LEAST_ARREST_S,
+            rest_before_s=run.align_s,
+            rest_after_s=run.rest_s if run.turns == 1 else LEAST_ARREST_S,
         )

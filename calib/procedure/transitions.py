@@ -1,10 +1,11 @@
-"""Transition table of the procedure.
+"""Transition tables of the procedures.
 
-    PREFLIGHT -> PLACE -> SETTLE -> ALIGN -> ROTATE -> REST -> VERDICT -> PLACE (next step, or again) ... DONE
-                                             ROTATE <- REST  (next turn)
+    arms            PREFLIGHT -> PLACE -> SETTLE -> ALIGN -> ROTATE -> REST -> VERDICT -> PLACE ... DONE
+                                                             ROTATE <- REST  (next turn)
+    sensors, noise  PREFLIGHT -> PLACE -> REST -> VERDICT -> PLACE (next step, or again) ... DONE
 
-Every change of phase is a row of `TRANSITIONS`. An outcome without a row is ignored in that phase. The first
-phase is PREFLIGHT, or DONE where an earlier session has accepted every step.
+Every change of phase is a row of the table of the kind. An outcome without a row is ignored in that phase.
+The first phase is PREFLIGHT, or DONE where an earlier session has accepted every step.
 """
 
 from enum import Enum, auto
@@ -36,9 +37,22 @@ IN_A_STEP: Final = (Phase.PLACE, Phase.SETTLE, Phase.ALIGN, Phase.ROTATE, Phase.
 """Phases of a step."""
 
 
-TRANSITIONS: Final[dict[tuple[Phase, Outcome], Phase]] = {
+_COMMON: Final[dict[tuple[Phase, Outcome], Phase]] = {
     (Phase.PREFLIGHT, Outcome.CHECKED): Phase.PLACE,
     (Phase.PREFLIGHT, Outcome.ABORTED): Phase.ABORTED,
+    **{(phase, Outcome.REJECTED): Phase.VERDICT for phase in IN_A_STEP},
+    **{(phase, Outcome.AGAIN): Phase.PLACE for phase in IN_A_STEP},
+    **{(phase, Outcome.NEXT_STEP): Phase.PLACE for phase in IN_A_STEP},
+    **{(phase, Outcome.COMPLETED): Phase.DONE for phase in IN_A_STEP},
+    **{(phase, Outcome.ABORTED): Phase.ABORTED for phase in IN_A_STEP},
+    (Phase.REST, Outcome.ACCEPTED): Phase.VERDICT,
+    (Phase.DONE, Outcome.REJECTED): Phase.VERDICT,
+    (Phase.DONE, Outcome.AGAIN): Phase.PLACE,
+}
+
+
+TRANSITIONS: Final[dict[tuple[Phase, Outcome], Phase]] = {
+    **_COMMON,
     (Phase.PLACE, Outcome.PLACED): Phase.SETTLE,
     (Phase.SETTLE, Outcome.DISPLACED): Phase.PLACE,
     (Phase.SETTLE, Outcome.SETTLED): Phase.ALIGN,
@@ -47,16 +61,15 @@ TRANSITIONS: Final[dict[tuple[Phase, Outcome], Phase]] = {
     (Phase.ROTATE, Outcome.DISTURBED): Phase.SETTLE,
     (Phase.ROTATE, Outcome.TURNED): Phase.REST,
     (Phase.REST, Outcome.NEXT_TURN): Phase.ROTATE,
-    (Phase.REST, Outcome.ACCEPTED): Phase.VERDICT,
-    **{(phase, Outcome.REJECTED): Phase.VERDICT for phase in IN_A_STEP},
-    **{(phase, Outcome.AGAIN): Phase.PLACE for phase in IN_A_STEP},
-    **{(phase, Outcome.NEXT_STEP): Phase.PLACE for phase in IN_A_STEP},
-    **{(phase, Outcome.COMPLETED): Phase.DONE for phase in IN_A_STEP},
-    **{(phase, Outcome.ABORTED): Phase.ABORTED for phase in IN_A_STEP},
-    (Phase.DONE, Outcome.REJECTED): Phase.VERDICT,
-    (Phase.DONE, Outcome.AGAIN): Phase.PLACE,
 }
-"""Next phase by phase and outcome."""
+"""Next phase by phase and outcome, for the arms."""
+
+
+OF_RESTS: Final[dict[tuple[Phase, Outcome], Phase]] = {
+    **_COMMON,
+    (Phase.PLACE, Outcome.PLACED): Phase.REST,
+}
+"""The same for the sensors and the noise."""
 
 
 NEW_ATTEMPT: Final = (Outcome.CHECKED, Outcome.AGAIN, Outcome.NEXT_STEP)

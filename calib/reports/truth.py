@@ -1,13 +1,18 @@
-"""Identified lever arms against the true ones, which only a simulation knows."""
+"""Identified lever arms, or a certificate, against the true ones, which only a simulation knows."""
 
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
 from calib.estimation.result import TO_DIFFERENCES
 from calib.lever_arms.gauge import LeverArms
 from calib.reports.document import Document, KeyValues, Section, Table
+from imudrv.calibration import Calibration
 from imudrv.units import MM
+
+LEAST_U: Final = 1e-12
+"""Below it a number is fixed by the gauge."""
+
 
 _PAIRS: Final = ("r_x - r_y", "r_x - r_z")
 
@@ -40,3 +45,43 @@ def comparison(found: LeverArms, true: LeverArms, name: str) -> Document:
     table = tuple((name, *(f"{x:.4f}" for x in row)) for name, row in rows.items())
     blocks = KeyValues(tuple(results)), Table("Differences, mm", ("", "X", "Y", "Z"), table)
     return Document("Against the truth", name, (Section("Error", blocks),))
+
+
+def calibration_comparison(found: Calibration, true: Calibration, name: str) -> Document:
+    """Return the comparison of the sensors of a certificate with true ones.
+
+    Parameters
+    ----------
+    found : Calibration
+        The result, with its covariance in the provenance (`calib sensors`).
+    true : Calibration
+        Of the simulated unit.
+    name : str
+        Its name.
+
+    Returns
+    -------
+    Document
+        The error of each number that was estimated, in the unit of the file, and in its u.
+    """
+    covariance = None if found.sensors is None else found.sensors.covariance
+    rows, largest = [], 0.0
+    if covariance is not None:
+        for path, variance in zip(covariance.names, np.diag(covariance.matrix).tolist(), strict=True):
+            u = max(variance, 0.0) ** 0.5
+            if u < LEAST_U or (".C_" in path and path[-5] == path[-2]):  # rows have the length 1
+                continue
+            error = _number(found, path) - _number(true, path)
+            largest = max(largest, abs(error) / u)
+            rows.append((path, f"{error:.3g}", f"{u:.3g}", f"{abs(error) / u:.1f}"))
+    table = Table("Errors of the numbers that were estimated", ("", "error", "u", "error in u"), tuple(rows))
+    results = KeyValues((("largest error", f"{largest:.1f} u"),))
+    return Document("Against the truth", name, (Section("Error", (results, table) if rows else (results,)),))
+
+
+def _number(calibration: Calibration, path: str) -> float:
+    """Return a number of a certificate by its path, such as gyro.C_bg[1][0]."""
+    place: Any = calibration.model_dump(exclude={"provenance"})
+    for key in path.replace("]", "").replace("[", ".").split("."):
+        place = place[int(key)] if key.isdigit() else place[key]
+    return float(place)

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from math import degrees, radians, sin
 from pathlib import Path
 from typing import Final, Literal
@@ -11,6 +12,8 @@ from typing import Final, Literal
 import numpy as np
 
 from calib.inputs import StrPath, profile_of, require_six_axes, site_of
+from calib.messages import english
+from calib.procedure.planned_turn import turn_fault
 from calib.procedure.schema import Procedure
 from calib.sensors.adjustment import (
     MEASURED_GRAVITY,
@@ -39,6 +42,7 @@ from calib.sensors.result import CaptureInput, Judgement, SensorsInput, SensorsR
 from calib.sensors.verdict import (
     REDUCED_BAD,
     SCALE_LIMIT,
+    dither_judgement,
     earth_judgement,
     gravity_judgement,
     grouped,
@@ -232,7 +236,8 @@ def solve(
     except NoConvergence as error:
         if options.free.fixed_pivot:
             _require_fixed_pivot(evidence, p, attitudes, options.free, gravity_sigma, reference)
-        return failed(poses, (Judgement("bad", f"{error}. No certificate is made."),))
+        bad = Judgement("bad", f"{error}. No certificate is made.")
+        return failed(poses, (bad, *dither_judgement(evidence)))
     if options.free.fixed_pivot and found.reduced > REDUCED_BAD:
         _require_fixed_pivot(evidence, p, attitudes, options.free, gravity_sigma, reference)
     faces = find_faces(found.attitudes) if options.frame == "faces" else None
@@ -250,6 +255,7 @@ def solve(
     )
     verdict = [
         *_unplanned(result.poses, procedure),
+        *_turns(found, evidence, result.poses, procedure),
         *judge(found, result.estimates, evidence, result.poses),
         *extra,
         *gravity_judgement(site, gravity_sigma),
@@ -275,6 +281,21 @@ def _unplanned(poses: Sequence[str], procedure: Procedure | None) -> Iterator[Ju
     absent = [name for name in planned if name not in poses]
     if absent:
         yield Judgement("note", f"Planned and not found: {', '.join(absent)}.")
+
+
+def _turns(
+    adjustment: Adjustment, evidence: Evidence, poses: Sequence[str], procedure: Procedure | None
+) -> Iterator[Judgement]:
+    """Yield the sentences on motions that are not the turns planned for a table."""
+    planned = {(a.id, b.id): b.turn for a, b in pairwise(procedure.rests)} if procedure else {}
+    for link in evidence.links:
+        turn = planned.get((poses[link.before], poses[link.after]))
+        if turn is None:
+            continue
+        p = adjustment.p
+        turned = p.W @ link.samples["gyro"].sum(axis=0) - p.beta * link.duration_s
+        if fault := turn_fault(turn, turned.tolist()):
+            yield Judgement("caution", f"To {poses[link.after]}: {english(fault)}.")
 
 
 def _missing(result: SensorsResult) -> Iterator[str]:
@@ -375,9 +396,9 @@ def _planned(procedure: Procedure) -> Iterator[tuple[str, Array]]:
     """Yield name and attitude C_bn of each planned rest; those of a rotation are one pose."""
     for rest in procedure.rests:
         yield rest.id, rest.C_bn
-    for step in procedure.steps:
-        yield step.id, step.C_bn
-        yield step.id, step.C_bn @ np.diag([-1.0, -1.0, 1.0])
+    for run in procedure.runs:
+        yield run.id, run.C_bn
+        yield run.id, run.C_bn @ np.diag([-1.0, -1.0, 1.0])
 
 
 def named_poses(attitudes: Sequence[Array], procedure: Procedure | None) -> tuple[str, ...]:

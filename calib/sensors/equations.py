@@ -18,7 +18,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.sensors.evidence import Evidence, Link, Noise, RestBins, edge_variance
+from calib.detection.rest_bins import Noise, RestBins
+from calib.sensors.evidence import Evidence, Link, edge_variance
 from calib.sensors.motion import integrate
 from calib.sensors.parameters import (
     ACCELEROMETER_SCALE_T,

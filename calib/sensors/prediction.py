@@ -15,9 +15,10 @@ from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
 from calib.axes import Side, vector
+from calib.detection.rest_bins import Noise, RestBins
 from calib.sensors.adjustment import MEASURED_GRAVITY, NORMAL_GRAVITY, Free, information, posterior
 from calib.sensors.equations import Equations
-from calib.sensors.evidence import Evidence, Link, Noise, RestBins
+from calib.sensors.evidence import Evidence, Link
 from calib.sensors.motion import SAMPLE
 from calib.sensors.observability import RATIO
 from calib.sensors.parameters import NominalScales, Number, Parameters, start_parameters
@@ -33,7 +34,11 @@ from imudrv.units import ARCSEC, DEG, DEG_PER_SQRT_H, UG
 TYPICAL_NOISE: Final = Noise(0.002 * DEG_PER_SQRT_H, 5 * UG)
 """Noise of a unit of the kind."""
 TYPICAL_SCALES: Final = NominalScales(0.5 * ARCSEC, 2000.0)
-MOTION_S: Final = 4.0
+TURN_S: Final = 4.0
+"""Length of a turn by hand, s."""
+LIFT_S: Final = 1.0
+"""Time by which a hand lifts the unit before it turns it, and sets it down after that, s."""
+MOTION_S: Final = TURN_S + 2.0 * LIFT_S
 """Length of a motion by hand, without the guards of the rests, s."""
 WOBBLE: Final = 1.5 * DEG
 _WOBBLE_HZ: Final = 1.3
@@ -123,7 +128,7 @@ def predict_sensors(
     rest_s, motion_s : float
         Length of each rest, and of each motion without the guards of the rests.
     wobble : float
-        Amplitude by which the hand sways, rad; 0: a turntable.
+        Amplitude by which the hand sways, rad; 0: a turntable, which lifts nothing.
     free : Free, optional
         Parameters to estimate.
     noise : Noise
@@ -286,7 +291,8 @@ class _Plan(NamedTuple):
 
 def _turn(before: Array, after: Array, p: Parameters, duration_s: float, wobble: float) -> Records:
     """Return the samples of a turn about one axis that sways about all three, without translation."""
-    turning, guard = round(duration_s * _RATE_HZ), round(GUARD_S * _RATE_HZ)
+    lift_s = LIFT_S if wobble else 0.0
+    turning, guard = round((duration_s - 2.0 * lift_s) * _RATE_HZ), round((GUARD_S + lift_s) * _RATE_HZ)
     n, T = turning + 2 * guard, 1.0 / _RATE_HZ
     whole = Rotation.from_matrix(after @ before.T).as_rotvec()
     share = np.clip((np.arange(n + 1) - guard) / turning, 0.0, 1.0)

@@ -12,8 +12,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.detection.rest_bins import BIN_S, LEAST_RESTS, Noise, RestBins, binned, rest_noise
 from calib.detection.segments import Segmenter
-from calib.sensors.evidence import Evidence, Left, Link, Noise, RestBins, rest_noise
+from calib.estimation.dither_line import dither_lines
+from calib.messages import english
+from calib.sensors.evidence import Evidence, Left, Link
 from calib.sensors.motion import SAMPLE, STEADY
 from calib.sensors.parameters import NominalScales
 from imudrv.arrays import Array
@@ -22,7 +25,7 @@ from imudrv.imu.coefficients import Coefficients
 from imudrv.imu.compensation import Compensator
 from imudrv.imu.rate_filter import RateFilter, rate_filter
 from imudrv.records import Flag, Records
-from imudrv.units import ARCSEC, NS, STANDARD_GRAVITY, UG
+from imudrv.units import ARCSEC, NS
 from imudrv.wire.layout import Layout
 
 GUARD_S: Final = 1.0
@@ -31,11 +34,6 @@ LEAST_REST_S: Final = 20.0
 """Shortest rest that is used, s."""
 LONGEST_MOTION_S: Final = 900.0
 """Longest motion that links two rests, s."""
-BIN_S: Final = 1.0
-"""Averaging time of a count at an edge, s."""
-DRIFT_SIGMAS: Final = 5.0
-DRIFT_FLOOR: Final = 1.5 * UG
-"""A rest moves if its force changes by more than this many sigma; the floor allows for wander, m/s^2."""
 
 BAD_FLAGS: Final = int(Flag.SATURATED | Flag.FAULT)
 GAP_FLAGS: Final = int(Flag.MISSING_BEFORE | Flag.LONG_INTERVAL)
@@ -85,13 +83,8 @@ def read_evidence(
     noise = rest_noise(found)
     still = []
     for rest in found:
-        change, sigma = rest.drift(noise, quanta[1])
-        if change > DRIFT_SIGMAS * sqrt(sigma**2 + DRIFT_FLOOR**2):
-            moved = change / STANDARD_GRAVITY / ARCSEC
-            reason = (
-                f"its force changed by {change / UG:.0f} ug, as by a tilt of {moved:.0f} arcsec: no "
-                "rest, a part of the motion"
-            )
+        if drift := rest.drift(noise, quanta[1]):
+            reason = f"{english(drift)}: no rest, a part of the motion"
             left.append(Left(rest.session, rest.start_s, rest.stop_s, "rest", reason))
         else:
             still.append(rest)
@@ -111,7 +104,8 @@ def read_evidence(
                 left.append(item)
     ordered = tuple(sorted(left, key=lambda one: (one.session, one.start_s)))
     rates = _rate_filter(still, noise, quanta[0], layout)
-    return Evidence(tuple(still), tuple(links), ordered, noise, quanta, fastest, rates)
+    dither = dither_lines(still[0].beginning, samples_s(layout))
+    return Evidence(tuple(still), tuple(links), ordered, noise, quanta, fastest, rates, dither)
 
 
 KNOCK_S: Final = 10.0
@@ -131,6 +125,8 @@ def _division(link: Link, rests: Sequence[RestBins], cuts: Set[tuple[int, int]])
     yield Left(before.session, before.start_s, after.stop_s, "rest", reason)
 
 
+DITHER_S: Final = 4.0
+"""Length of the beginning of a rest that shows a dither line, s."""
 DITHER: Final = 0.5 * ARCSEC
 """Scatter of an angle increment beside pulses and noise that counts as dither, rms."""
 
@@ -144,10 +140,6 @@ def _rate_filter(rests: Sequence[RestBins], noise: Noise, quantum: float, layout
         return rate_filter("dither", layout.interval_ns)
     except InputError:  # it is aliased into the motion; the residuals show it
         return STEADY
-
-
-LEAST_RESTS: Final = 3
-"""Fewest rests that are solved."""
 
 
 def too_few_text(rests: Sequence[RestBins], left: Sequence[Left]) -> str:
@@ -207,9 +199,9 @@ class _Binner:
 
     def __init__(self, samples: int) -> None:
         self._samples = samples
-        self._weights = (samples - np.arange(samples)) / samples
         self.runs: list[tuple[int, list[Array], list[Array], list[Array]]] = []
         self._squares: list[Array] = []  # variance of the gyros' increments, bin by bin
+        self._first: list[Array] = []
         self.bad = 0
         self.gaps = 0
         self._rest: Array = np.zeros((0, 10))
@@ -230,10 +222,20 @@ class _Binner:
         self._rest = rows[n * self._samples :]
         if n:
             _, sums, means, degc = self.runs[-1]
-            sums.append(bins[:, :, :6].sum(axis=1))
-            means.append(np.tensordot(bins[:, :, :6], self._weights, (1, 0)))
+            for some, new in zip(
+                (sums, means), binned(bins[:, :, :6].reshape(-1, 6), self._samples), strict=True
+            ):
+                some.append(new)
             degc.append(bins[:, :, 6:].mean(axis=1))
             self._squares.append(bins[:, :, :3].var(axis=1))
+            if sum(map(len, self._first)) < DITHER_S / BIN_S * self._samples:
+                self._first.append(bins[:, :, :3].reshape(-1, 3))
+
+    @property
+    def beginning(self) -> Array:
+        """The first angle increments, shape (n, 3)."""
+        most = round(DITHER_S / BIN_S) * self._samples
+        return np.concatenate(self._first)[:most] if self._first else np.zeros((0, 3))
 
     @property
     def shaking(self) -> float:
@@ -305,6 +307,7 @@ def _bins(
                 temperatures.mean(axis=0),
                 span,
                 binner.shaking,
+                binner.beginning,
             )
         )
     return rests, left

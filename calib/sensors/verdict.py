@@ -13,7 +13,7 @@ from calib.sensors.evidence import Evidence
 from calib.sensors.result import Estimate, Judgement
 from imudrv.nav.earth import EARTH_RATE
 from imudrv.site import Site
-from imudrv.units import DEG_PER_H, UG
+from imudrv.units import ARCSEC, DEG_PER_H, UG
 
 REDUCED_CAUTION: Final = 1.5
 REDUCED_BAD: Final = 2.0
@@ -51,6 +51,8 @@ def judge(
             f"The reduced chi-square is {reduced:.2f} ({freedom} degrees of freedom), above "
             f"{REDUCED_CAUTION:g}.",
         )
+    if reduced > REDUCED_CAUTION:
+        yield from dither_judgement(evidence)
     yield from _wander(adjustment)
     yield from _blocks(adjustment, evidence, poses)
     yield from _scales(adjustment)
@@ -58,6 +60,21 @@ def judge(
         yield Judgement(
             "note", f"Not observable, and kept at the start or left out: {', '.join(grouped(lacking))}."
         )
+
+
+def dither_judgement(evidence: Evidence) -> Iterator[Judgement]:
+    """Yield the sentence on dither in the increments, which contradicts the motions where it is large."""
+    if not evidence.dither:
+        return
+    lines = ", ".join(
+        f"{line.amplitude_rad / ARCSEC:.3g} arcsec at {line.frequency_hz:.0f} Hz about {line.axis}"
+        for line in evidence.dither
+    )
+    yield Judgement(
+        "caution",
+        f"The angle increments at rest carry dither: {lines}. Let the unit remove it from the increments, or "
+        "lower it; the motions are then free of it.",
+    )
 
 
 def _wander(adjustment: Adjustment) -> Iterator[Judgement]:

@@ -445,7 +445,7 @@ def found(monkeypatch: pytest.MonkeyPatch) -> None:
     """A result without recordings."""
 
     nothing: Any = SimpleNamespace(arms=None, created=datetime(2026, 1, 1, tzinfo=UTC))
-    monkeypatch.setattr(completion, "identify_session", lambda _: Result(nothing, NOMINAL))
+    monkeypatch.setattr(completion, "compute", lambda _: Result(nothing, NOMINAL))
     monkeypatch.setattr(controllers, "summarise", lambda *_: None)
 
 

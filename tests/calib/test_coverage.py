@@ -7,11 +7,11 @@ import pytest
 
 from calib.bench.result import decode_covered, uncovered
 from calib.bench.state import Attempt
-from calib.procedure.schema import Step
+from calib.procedure.schema import Run
 from imudrv import profiles
 from imudrv.errors import InputError
 
-STEP = Step("z-up", "+Z", "+X", 180, 30.0, 4.0)
+STEP = Run("z-up", "+Z", "+X", 4.0, 180, 30.0)
 FIRST, LAST = 2000, 4999
 
 Recorded = Callable[..., Path]

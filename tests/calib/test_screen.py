@@ -233,7 +233,7 @@ def test_a_terminal_of_ascii_gets_english() -> None:
     shown.say(message("computing"))
     shown.close()
     out.seek(0)
-    assert out.read() == "Computing the lever arms from the recordings ...\n"
+    assert out.read() == "Computing the result from the recordings ...\n"
 
 
 def test_without_a_terminal_each_change_is_a_line() -> None:

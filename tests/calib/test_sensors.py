@@ -9,17 +9,24 @@ import numpy as np
 import pytest
 
 from calib.cli import main
+from calib.detection.rest_bins import Noise
+from calib.estimation.dither_line import DitherLine
+from calib.procedure.schema import Procedure
 from calib.sensors.adjustment import Free
 from calib.sensors.calibrate import SensorsOptions, calibrate_sensors
+from calib.sensors.calibrate import solve as solve_evidence
 from calib.sensors.certificate import certificate, result_document
+from calib.sensors.evidence import Evidence
 from calib.sensors.parameters import NominalScales
 from calib.sensors.prediction import PlannedPose, additions, predict_sensors, turned
 from calib.sensors.rests import read_evidence
 from calib.sensors.result import SensorsResult
+from calib.sensors.verdict import dither_judgement
 from imudrv import profiles
 from imudrv.calibration import Calibration, read_calibration, write_calibration
 from imudrv.errors import InputError
 from imudrv.files import settings_file
+from imudrv.files.settings_file import parse
 from imudrv.nav.attitude import rotation
 from imudrv.records import Flag, Records
 from imudrv.sensor_calibration import number_paths
@@ -411,10 +418,44 @@ def test_dither_in_the_increments_is_taken_off_the_rates(tmp_path):
     path = write_session(unit, layout, tmp_path)
     found = calibrate_sensors([path], site=SITE, unit=UNIT, profile="imu50-rs422")
     assert found.evidence.is_dithered
+    assert [line.axis for line in found.evidence.dither] == ["X", "Y", "Z"]
+    for line, hz in zip(found.evidence.dither, dither["frequency_hz"], strict=True):
+        assert abs(line.frequency_hz - hz) <= 1.0  # a window of a second
+        assert abs(line.amplitude_rad / ARCSEC - 20.0) < 2.0  # the pulses of half an arcsecond
+    assert not any("dither" in one.text for one in found.verdict)
     truth = true_numbers(unit)
     arms = [one for one in found.estimates if one.path.startswith("size_effect")]
     # Without the filter they are wrong by up to 0.3 mm, 21 sigma.
     assert max(abs(one.value - truth[one.path]) / one.sigma for one in arms) < 4.0
+
+
+def test_dither_that_contradicts_the_motions_is_named():
+    line = DitherLine("Y", 402.0, 100.0 * ARCSEC)
+    evidence = Evidence((), (), (), Noise(1e-7, 1e-5), (0.0, 0.0), dither=(line,))
+    (said,) = dither_judgement(evidence)
+    assert said.mark == "caution"
+    assert "carry dither: 100 arcsec at 402 Hz about Y. Let the unit remove it" in said.text
+
+
+def test_the_turn_that_a_procedure_plans_for_a_table_is_checked_against_the_gyros(result):
+    def planned(deg: float) -> Procedure:
+        pose = {"up": "+Z", "east": "-X", "turn": {"about": "+Z", "deg": deg, "seconds": 4}}
+        poses = [{"id": "first", "up": "+Z", "east": "+X"}, {"id": "second", **pose}]
+        head = {"format": "imu50-procedure", "version": 2, "name": "table", "kind": "sensors", "rest_s": 20}
+        return parse({**head, "poses": poses}, Procedure, "table")
+
+    right, wrong = (
+        [
+            one.text
+            for one in solve_evidence(result.inputs, result.evidence, SensorsOptions(), planned(deg)).verdict
+            if "turned" in one.text
+        ]
+        for deg in (180.0, -180.0)
+    )
+    assert right == []
+    (text,) = wrong
+    assert text.startswith("To second: turned ")
+    assert text.endswith("the sign is wrong, in the file or of the gyro.")
 
 
 def test_the_golden_set_gives_the_errors_that_were_injected(data, tmp_path):

@@ -9,7 +9,7 @@ import pytest
 from calib.messages import verbatim
 from calib.procedure.engine import Engine
 from calib.procedure.events import Abort, Action, Confirm, Entered, Phase, Redo, Skip
-from calib.procedure.phases import STATES
+from calib.procedure.rotations import STATES
 from calib.procedure.schema import Procedure
 from calib.procedure.transitions import TRANSITIONS, Outcome
 from imudrv.files.settings_file import parse

@@ -159,7 +159,7 @@ function drawSteps() {
   }));
 }
 function drawButtons() {
-  const asks = Boolean(result && result.r_mm);
+  const asks = Boolean(result && result.table);
   const may = (action) => acting && !ended && !asks && view && view.actions.includes(action);
   for (const action of ["confirm", "redo", "skip", "abort"]) $(action).disabled = !may(action);
   $("back").hidden = !may("back");
@@ -167,26 +167,24 @@ function drawButtons() {
   $("progress").style.width = `${100 * ((view && view.progress) || 0)}%`;
 }
 function drawResult() {
-  const showing = Boolean((result && result.r_mm) || ended);
+  const showing = Boolean((result && result.table) || ended);
   $("live").hidden = showing;
   for (const action of ["confirm", "redo", "skip", "abort"]) $(action).hidden = showing;
   $("outcome").hidden = !showing;
-  $("ask").hidden = !(result && result.r_mm) || !acting;
+  $("ask").hidden = !(result && result.table) || !acting;
   for (const id of ["arms", "verdicts", "points"]) $(id).replaceChildren();
-  if (!result || !result.r_mm) return;
-  const head = ["", "X", "Y", "Z", ...(result.u_mm ? ["u(X)", "u(Y)", "u(Z)"] : [])];
-  const rows = result.r_mm.map((r, k) => [`r_${"xyz"[k]}`, ...r.map((v) => (v < 0 ? "" : "+") + v.toFixed(3)),
-    ...(result.u_mm ? result.u_mm[k].map((u) => u.toFixed(3)) : [])]);
-  for (const row of [head, ...rows]) {
+  if (!result || !result.table) return;
+  for (const row of result.table) {
     const line = element("tr", {}, $("arms"));
-    for (const cell of row) element(row === head ? "th" : "td", {}, line).textContent = cell;
+    for (const cell of row) element(row[0] ? "td" : "th", {}, line).textContent = cell;
   }
-  element("caption", {}, $("arms")).textContent = label("points").replace("{gauge}", result.gauge);
+  if (result.gauge) element("caption", {}, $("arms")).textContent = label("points").replace("{gauge}", result.gauge);
   for (const [mark, text] of result.verdicts) {
     const line = element("li", { class: mark }, $("verdicts"));
     element("b", {}, line).textContent = `${label(mark)}: `;
     line.append(inLanguage(text));
   }
+  if (!result.r_mm) return;
   const most = 1.25 * Math.max(...result.r_mm.flat().map(Math.abs), 1);
   for (const [h, v] of [[0, 1], [0, 2]]) {
     const view2 = svg("svg", { viewBox: "-110 -110 220 220" }, $("points"));
@@ -245,7 +243,7 @@ const taken = {
   },
   result(content) {
     result = content;
-    if (content.r_mm) beep(TONES.good, 0.3);
+    if (content.table) beep(TONES.good, 0.3);
     drawResult();
     draw();
   },
