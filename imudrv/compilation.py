@@ -9,10 +9,12 @@ What is compiled is in `imudrv.kernel_parts`, which only those processes import.
 """
 
 import os
+import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final
 
@@ -40,6 +42,9 @@ COMPILING: Final = b"c"
 """and when it begins to compile a kernel."""
 
 _PROCESSES: Final = 2
+
+_UNUSED_S: Final = 28 * 86_400.0
+"""Kernels of another version are removed if none was added for this time, s."""
 
 _is_program = False
 
@@ -70,6 +75,7 @@ def missed_a_kernel(folder: Path) -> bool:
     if not can_keep(folder):
         return False
     compile_all()
+    remove_unused(folder)
     return True
 
 
@@ -80,6 +86,22 @@ def can_keep(folder: Path) -> bool:
     except OSError:
         return False
     return os.access(folder, os.W_OK)
+
+
+def remove_unused(folder: Path) -> None:
+    """Remove the kernels of other versions to which none was added for four weeks.
+
+    Safe beside other programs: a kernel that is not there is compiled.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of this version's kernels, which stays; those of other versions are beside it.
+    """
+    for other in folder.parent.glob("kernels-" + "[0-9a-f]" * 16):
+        with suppress(OSError):  # another program removes it, too
+            if other.name != folder.name and time.time() - other.lstat().st_mtime > _UNUSED_S:
+                shutil.rmtree(other, ignore_errors=True)
 
 
 def compile_all() -> bool:

@@ -3,16 +3,19 @@
 import os
 import pty
 import re
+import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 from samples import CERTIFICATE
 
 from imudrv import profiles
-from imudrv.compilation import PARTS
+from imudrv.compilation import PARTS, remove_unused
 from imudrv.records import PULSES
 from imudrv.wire.encode import StreamEncoder
 
@@ -136,25 +139,81 @@ def test_once_the_kernels_of_can_are_loaded_none_is_loaded_later(profile: str, t
     assert done.stdout == "later: {}\n"
 
 
+class Filled(NamedTuple):
+    """A folder of compiled kernels, filled by the first command; what that showed on its terminal."""
+
+    folder: Path
+    shown: bytes
+    output: str
+
+
+DECODE = ("-m", "imudrv", "decode", "a.raw", "--profile", "imu50-rs422", "-o")
+
+
 @pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of compiled kernels, filled by `imudrv warm`."""
+def first_command(tmp_path_factory: pytest.TempPathFactory) -> Filled:
     folder = tmp_path_factory.mktemp("cache")
-    done = run("-m", "imudrv", "warm", cwd=folder, NUMBA_CACHE_DIR=str(folder))
+    samples = np.zeros(20, PULSES)
+    samples["counter"] = np.arange(20)
+    (folder / "a.raw").write_bytes(
+        StreamEncoder(profiles.load("imu50-rs422").layout()).encode(samples).tobytes()
+    )
+    terminal, stderr = pty.openpty()
+    with subprocess.Popen(
+        [sys.executable, *DECODE, "a.csv"],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "NUMBA_CACHE_DIR": str(folder)},
+        stdout=subprocess.DEVNULL,
+        stderr=stderr,
+    ) as process:
+        os.close(stderr)
+        shown = b""
+        try:
+            while piece := os.read(terminal, 4096):
+                shown += piece
+        except OSError:  # its last user has closed it
+            pass
+    os.close(terminal)
+    assert process.returncode == 0, shown
+    return Filled(folder, shown, (folder / "a.csv").read_text())
+
+
+def test_the_first_command_has_all_kernels_compiled_and_says_so_on_the_terminal(
+    first_command: Filled, tmp_path: Path
+) -> None:
+    folder, shown, output = first_command
+    assert b"\r" + NOTE.encode() in shown  # a progress bar of the command may be there already
+    assert b": %d of %d parts" % (len(PARTS), len(PARTS)) in shown
+    again = run(*DECODE, tmp_path / "b.csv", cwd=folder, NUMBA_CACHE_DIR=str(folder))
+    assert (again.returncode, again.stderr) == (0, "")
+    assert output == (tmp_path / "b.csv").read_text()
+
+
+def test_the_warm_up_compiles_what_is_missing_says_so_once_and_then_has_nothing_to_do(
+    first_command: Filled, tmp_path: Path
+) -> None:
+    shutil.copytree(first_command.folder, tmp_path / "cache")
+    missing = [path for path in (tmp_path / "cache").rglob("*.kernel") if "candump" in path.name]
+    for path in missing:
+        path.unlink()
+    old = tmp_path / "cache" / "imu50" / f"kernels-{'0' * 16}"
+    old.mkdir()
+    os.utime(old, (0, 0))
+    done = run("-m", "imudrv", "warm", cwd=tmp_path, NUMBA_CACHE_DIR=str(tmp_path / "cache"))
     assert done.returncode == 0, done.stderr
     assert done.stderr.startswith(NOTE)
     assert done.stderr.count("\n") == 1
-    assert " kernels compiled" in done.stdout
-    return folder
-
-
-def test_a_second_warm_up_has_nothing_to_do_and_says_so(cache: Path, tmp_path: Path) -> None:
-    done = run("-m", "imudrv", "warm", cwd=tmp_path, NUMBA_CACHE_DIR=str(cache))
+    assert f": {len(missing)} kernels compiled" in done.stdout
+    assert not old.exists()
+    assert missing
+    assert all(path.exists() for path in missing)
+    done = run("-m", "imudrv", "warm", cwd=tmp_path, NUMBA_CACHE_DIR=str(tmp_path / "cache"))
     assert (done.returncode, done.stderr) == (0, "")
     assert "nothing to do" in done.stdout
 
 
-def test_after_the_warm_up_no_command_compiles_a_kernel(cache: Path, tmp_path: Path) -> None:
+def test_after_the_warm_up_no_command_compiles_a_kernel(first_command: Filled, tmp_path: Path) -> None:
+    cache = first_command.folder
     (tmp_path / "unit.yaml").write_text(CERTIFICATE)
     (tmp_path / "site.yaml").write_text("{latitude_deg: 28.2, longitude_deg: 113.0, height_m: 60.0}")
     files = sorted(cache.rglob("*.kernel"))
@@ -186,35 +245,16 @@ def test_after_the_warm_up_no_command_compiles_a_kernel(cache: Path, tmp_path: P
         assert sorted(cache.rglob("*.kernel")) == files, line
 
 
-def test_the_first_command_has_all_kernels_compiled_and_says_so_on_the_terminal(tmp_path: Path) -> None:
-    samples = np.zeros(20, PULSES)
-    samples["counter"] = np.arange(20)
-    (tmp_path / "a.raw").write_bytes(
-        StreamEncoder(profiles.load("imu50-rs422").layout()).encode(samples).tobytes()
+def test_kernels_of_other_versions_are_removed_when_they_are_old(tmp_path: Path) -> None:
+    this, old, young, foreign = (
+        tmp_path / f"kernels-{end}" for end in ("1" * 16, "2" * 16, "3" * 16, "4" * 16 + ".bak")
     )
-    command = ["-m", "imudrv", "decode", "a.raw", "--profile", "imu50-rs422", "-o", "a.csv"]
-    terminal, stderr = pty.openpty()
-    with subprocess.Popen(
-        [sys.executable, *command],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "NUMBA_CACHE_DIR": str(tmp_path)},
-        stdout=subprocess.DEVNULL,
-        stderr=stderr,
-    ) as process:
-        os.close(stderr)
-        said = b""
-        try:
-            while piece := os.read(terminal, 4096):
-                said += piece
-        except OSError:  # its last user has closed it
-            pass
-    os.close(terminal)
-    assert process.returncode == 0
-    assert b"\r" + NOTE.encode() in said  # a progress bar of the command may be there already
-    assert b": %d of %d parts" % (len(PARTS), len(PARTS)) in said
-    again = run(*command[:-1], "b.csv", cwd=tmp_path, NUMBA_CACHE_DIR=str(tmp_path))
-    assert (again.returncode, again.stderr) == (0, "")
-    assert (tmp_path / "a.csv").read_text() == (tmp_path / "b.csv").read_text()
+    for folder, days in ((this, 40), (old, 40), (young, 20), (foreign, 40)):
+        folder.mkdir()
+        (folder / "a.kernel").write_bytes(b"kernel")
+        os.utime(folder, times=(time.time() - days * 86_400,) * 2)
+    remove_unused(this)
+    assert sorted(tmp_path.iterdir()) == [this, young, foreign]
 
 
 def test_a_folder_that_cannot_be_written_to_is_named(tmp_path: Path) -> None:

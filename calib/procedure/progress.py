@@ -195,7 +195,7 @@ class Progress:
         navigator = Navigator(self.site.place, q_nb, C_ba=self.calibration.accelerometer.C_ba)
         self.attempt.navigate(navigator, turn(conjugate(q_nb), (0.0, 0.0, 1.0)))
 
-    def warn(self, *reasons: Message) -> None:
+    def tell(self, *reasons: Message) -> None:
         """Show the operator what was wrong; the run continues."""
         self.bells += bool(reasons)
         self.reasons, self.last_try = reasons, ()

@@ -77,7 +77,7 @@ class PlacingForRest(Placing):
         if planned is not None and p.carried.is_whole and (fault := turn_fault(planned, p.carried.turned)):
             return p.reject(fault)
         if p.carried.missing:
-            p.warn(message("link_lost", missing=p.carried.missing))
+            p.tell(message("link_lost", missing=p.carried.missing))
         return super().placed()
 
     def prompt(self) -> Prompt:
@@ -171,7 +171,7 @@ class LongRest(PhaseState):
             p.elapsed_s -= block.seconds
             if not self._is_disturbed:
                 rest_s = p.step.rest_s
-                p.warn(message("stretch_ended", elapsed_s=p.elapsed_s, rest_s=rest_s, cause=cause))
+                p.tell(message("stretch_ended", elapsed_s=p.elapsed_s, rest_s=rest_s, cause=cause))
             self._is_disturbed = True
             return None
         self._is_disturbed = self._is_disturbed and p.stillness.quiet_s < READY_S

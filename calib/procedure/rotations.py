@@ -154,7 +154,7 @@ class Rotating(PhaseState):
             disturbed = message("rest_disturbed", angle_deg=rotation.size / DEG)
             if not attempt.turns:
                 return p.restart(disturbed)
-            p.warn(disturbed)
+            p.tell(disturbed)
             return Outcome.TURNED  # the rest has to be repeated
         attempt.process()
         if p.run.turns > 1:
@@ -192,7 +192,7 @@ class Rotating(PhaseState):
         attempt.judge(not reasons)
         if _is_wrong_way(rotation, p.turn_deg):
             reasons = (prompts.wrong_direction(rotation.angle_deg, p.turn_deg), *reasons)
-        p.warn(*reasons)
+        p.tell(*reasons)
         p.events.append(
             Turned(
                 step_id=p.step.id,
@@ -231,7 +231,7 @@ class Resting(PhaseState):
             interrupted = message("rest_interrupted", elapsed_s=p.elapsed_s, rest_s=rest_s, cause=cause)
             if p.run.turns == 1 or p.trouble(block):
                 return p.reject(interrupted)
-            p.warn(interrupted)
+            p.tell(interrupted)
             attempt.next_turn(p.run.turns)
             attempt.turn.feed(block)
             return Outcome.NEXT_TURN

@@ -60,6 +60,9 @@ def drawing(height_in: float) -> Iterator[tuple["Figure", BytesIO]]:
     with rc_context(_STYLE):
         figure, svg = Figure(figsize=(WIDTH_IN, height_in), layout="constrained"), BytesIO()
         yield figure, svg
+        if (layout := figure.get_layout_engine()) is not None:
+            layout.execute(figure)  # here, because saving a figure with a layout draws it twice
+            figure.set_layout_engine("none")
         figure.savefig(svg, format="svg", metadata={"Date": None})
 
 

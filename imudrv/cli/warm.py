@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Final
 
-from imudrv.compilation import can_keep, compile_all
+from imudrv.compilation import can_keep, compile_all, remove_unused
 from imudrv.errors import InputError
 from imudrv.kernels import FOLDER
 
@@ -22,6 +22,7 @@ def run(arguments: argparse.Namespace) -> None:
             f"{FOLDER or 'home folder'}: expected a folder to keep compiled kernels in; "
             "set XDG_CACHE_HOME to one that can be written to"
         )
+    remove_unused(FOLDER)
     before = _files(FOLDER)
     if not compile_all():
         raise InputError(
