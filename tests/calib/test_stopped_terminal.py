@@ -18,14 +18,14 @@ PROCEDURE = """
 format: imu50-procedure
 version: 1
 name: short
-align_s: 40
-rest_s: 8
+align_s: 30
+rest_s: 4
 poses:
   - {id: z-up, up: +Z, east: +X, turn_deg: 180}
   - {id: x-up, up: +X, east: +Y, turn_deg: 180}
   - {id: y-up, up: +Y, east: +Z, turn_deg: 180}
 """
-SPEED = 10
+SPEED = 25
 CTRL_S, CTRL_Q = b"\x13", b"\x11"
 
 
