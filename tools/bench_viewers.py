@@ -19,7 +19,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from multiprocessing.synchronize import Event
+from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
 from typing import Final
 
@@ -33,23 +33,58 @@ QUANTILES: Final = {"p50": 0.5, "p99": 0.99, "p99.9": 0.999}
 SETTLE_S: Final = 1.0
 
 
-def look(url: str, end: Event) -> None:
-    """Read frames of a page until the end."""
+class Viewers:
+    """Processes that read every frame of a page while they are told to, as browsers do.
 
-    async def read() -> int:
+    Parameters
+    ----------
+    url : str
+        Address of the page.
+    count : int
+        Number of viewers.
+    """
+
+    def __init__(self, url: str, count: int) -> None:
+        self._watch, self._end = multiprocessing.Event(), multiprocessing.Event()
+        self._frames = [multiprocessing.Value("l", 0) for _ in range(count)]
+        self._processes = [
+            multiprocessing.Process(target=self._run, args=(url, frames)) for frames in self._frames
+        ]
+        for process in self._processes:
+            process.start()
+
+    def begin(self) -> None:
+        """Connect all, and wait until each has got a frame."""
+        before = [frames.value for frames in self._frames]
+        self._watch.set()
+        while any(now.value <= then for now, then in zip(self._frames, before, strict=True)):
+            time.sleep(SETTLE_S)
+
+    def pause(self) -> None:
+        """Disconnect all."""
+        self._watch.clear()
+        time.sleep(SETTLE_S)
+
+    def close(self) -> None:
+        """End the processes."""
+        self._end.set()
+        self._watch.set()
+        for process in self._processes:
+            process.terminate()
+            process.join()
+
+    def _run(self, url: str, frames: "Synchronized[int]") -> None:
+        while self._watch.wait() and not self._end.is_set():
+            asyncio.run(self._read(url, frames))
+
+    async def _read(self, url: str, frames: "Synchronized[int]") -> None:
         base, _, query = url.partition("/?")
-        frames = 0
-        headers = {"Origin": base}
         async with (
             aiohttp.ClientSession() as session,
-            session.ws_connect(f"{base}/ws?{query}", headers=headers, compress=15) as page,
+            session.ws_connect(f"{base}/ws?{query}", headers={"Origin": base}, compress=15) as page,
         ):
-            while not end.is_set():
-                frames += "view" in (await page.receive_str())[:20]
-        return frames
-
-    if not asyncio.run(read()):
-        sys.exit("a viewer got no frame")
+            while self._watch.is_set():
+                frames.value += "view" in (await page.receive_str())[:20]
 
 
 def quantiles_us(counts: Counter[int]) -> dict[str, float]:
@@ -70,28 +105,12 @@ def window(status: Path, seconds: float) -> Counter[int]:
     return histogram() - before
 
 
-def looked_at(url: str, viewers: int, status: Path, seconds: float) -> Counter[int]:
-    """Return the histogram of a window with viewers."""
-    end = multiprocessing.Event()
-    processes = [multiprocessing.Process(target=look, args=(url, end)) for _ in range(viewers)]
-    for process in processes:
-        process.start()
-    time.sleep(SETTLE_S)
-    counts = window(status, seconds)
-    end.set()
-    for process in processes:
-        process.join()
-        if process.exitcode:
-            sys.exit("a viewer failed")
-    return counts
-
-
 def main() -> None:
     """Measure in turn, and print the medians of the quantiles and their ratios."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--viewers", type=int, default=5)
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--rounds", type=int, default=15)
+    parser.add_argument("--seconds", type=float, default=4.0)
     options = parser.parse_args()
     command = [sys.executable, "-m", "calib", "run", "--rehearse", "--web", "127.0.0.1:0", "--session", "s"]
     with tempfile.TemporaryDirectory() as folder:
@@ -111,9 +130,13 @@ def main() -> None:
             next(line for line in lines if "PRESS ENTER" in line)
             status = default_folder() / f"imu50-calib-{session.pid}.sock"
             alone, watched = [], []
+            viewers = Viewers(url, options.viewers)
             for _ in range(options.rounds):
                 alone.append(quantiles_us(window(status, options.seconds)))
-                watched.append(quantiles_us(looked_at(url, options.viewers, status, options.seconds)))
+                viewers.begin()
+                watched.append(quantiles_us(window(status, options.seconds)))
+                viewers.pause()
+            viewers.close()
         finally:
             session.kill()
             session.communicate()

@@ -70,6 +70,14 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
 
 
 @pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    """One for the tests that only look."""
+    bench = Bench(tmp_path_factory.mktemp("shared"))
+    yield bench
+    bench.kill()
+
+
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
@@ -151,33 +159,31 @@ def test_a_rehearsal_is_clicked_through_with_a_rejection_a_reconnect_and_a_viewe
     assert page.problems == []  # no error, and nothing from another host
 
 
-def test_without_the_token_or_with_another_origin_there_is_nothing(bench: Bench, browser: Any) -> None:
+def test_without_the_token_or_with_another_origin_there_is_nothing(shared: Bench, browser: Any) -> None:
     page = browser.new_page()
-    base = bench.url.partition("?")[0]
+    base = shared.url.partition("?")[0]
     assert page.goto(base).status == 403
     assert page.goto(f"{base}?token=wrong").status == 403
     assert page.goto(f"{base}report.html").status == 403
-    answer = page.goto(bench.url)
+    answer = page.goto(shared.url)
     assert answer.headers["content-security-policy"].startswith("default-src 'self';")
     script = """url => new Promise(done => {
         const socket = new WebSocket(url);
         socket.onopen = () => done(1);
         socket.onerror = () => done(0);
     })"""
-    socket = bench.url.replace("http", "ws").replace("/?", "/ws?")
+    socket = shared.url.replace("http", "ws").replace("/?", "/ws?")
     assert page.evaluate(script, socket) == 1
     page.goto("about:blank")
     assert page.evaluate(script, socket) == 0  # its origin is null
 
 
 @pytest.fixture(scope="module")
-def page(tmp_path_factory: pytest.TempPathFactory, browser: Any) -> Iterator[Any]:
-    bench = Bench(tmp_path_factory.mktemp("shared"))
-    page = opened(browser, bench.url)
+def page(shared: Bench, browser: Any) -> Iterator[Any]:
+    page = opened(browser, shared.url)
     eventually(page, "view !== null")
     yield page
     page.close()
-    bench.kill()
 
 
 @pytest.mark.parametrize("size", [(1280, 720), (800, 480), (375, 667)])
