@@ -28,7 +28,8 @@ class RotationLimits:
     axis_tilt_deg : float
         Maximum angle between the axis and the vertical.
     rest_before_s, rest_after_s : float
-        Minimum rests: for alignment and velocity before, for velocity after: 3 s, less the ends of the turns.
+        Minimum rests: for alignment and velocity before, for velocity after: an arrest of 3 s, less what
+        belongs to the turns.
     missing : int
         Maximum number of samples missing during the rotation.
     """

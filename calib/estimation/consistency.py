@@ -12,7 +12,7 @@ priors of the parameters of the runs are bounds, far wider than what they allow 
 parameter takes a degree of freedom as far as the data determine it. The noise itself is an estimate with f
 degrees of freedom. Near a turn the readings' own errors, which are known, exceed the random walk. Where only
 a share w of the scatter is due to the walk, an error of the noise changes the scatter by w times as much: it
-follows an F distribution with f / w^2 degrees of freedom of the noise.
+follows an F distribution with f / w^2 degrees of freedom of the noise. What a turn gains is a walk: w is 1.
 
 **Each turn against the others.** Freeing the step of one turn takes it out. The arms shift by the difference
 of the estimates, whose covariance is the difference of their covariances, and chi-square falls by a value
@@ -71,7 +71,9 @@ def scatter_and_redundancy(
     return (
         # level accelerometers that send hardly a pulse are read at the ends of the rests alone
         ChiSquare(scatter, freedom, _of_noise(system, free, noise)) if freedom > 0 else None,
-        ChiSquare(system.chi_square(x) - scatter if redundant else 0.0, redundant),
+        ChiSquare(system.chi_square(x) - scatter, redundant, noise.degrees_of_freedom)
+        if redundant
+        else ChiSquare(0.0, 0),
     )
 
 

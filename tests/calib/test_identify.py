@@ -158,6 +158,7 @@ def test_without_one_of_three_rotations_there_is_no_result_without_one_of_six_ne
 ) -> None:
     runs = simulated[0]
     three, six = estimate_joint(runs[:3]), estimate_joint(runs)
+    assert [found.redundancy.degrees_of_freedom for found in (three, six)] == [0, 2 * 6 - 6]
     assert [(left.rank, left.shift_m) for left in three.leave_one_out] == [(4, None)] * 3
     for k, left in enumerate(six.leave_one_out):
         assert left.rank == 6
@@ -227,27 +228,18 @@ def test_a_harder_budget_widens_the_prediction_with_the_error(budget: str) -> No
     assert found.predicted_mm > least_mm
 
 
-@pytest.mark.parametrize(("signs", "sigmas"), [((1,), 4.0), ((1, -1), 3.0)])
-def test_a_skew_of_one_sample_is_within_the_uncertainty(
-    monkeypatch: pytest.MonkeyPatch, signs: tuple[int, ...], sigmas: float
-) -> None:
-    scenario = montecarlo.scenario
-
-    def skewed(*arguments: Any) -> Any:
-        made = scenario(*arguments)
-        return made.model_copy(update={"unit": made.unit.model_copy(update={"accelerometer_skew_s": 1e-3})})
-
-    monkeypatch.setattr(montecarlo, "scenario", skewed)
-    worst = {0.0: 0.0, Priors().skew: 0.0}
+def test_a_skew_of_one_sample_is_within_the_uncertainty() -> None:
+    limits = {3: 4.0, 6: 3.0}  # twice the prior's sigma: three rotations do not determine the skew, six do
+    worst = {(rotations, skew): 0.0 for rotations in limits for skew in (0.0, Priors().skew)}
     for seed in range(400, 404):
-        runs, truth = montecarlo.case(seed, Budget(signs=signs))
-        for skew in worst:
-            found = estimate_joint(runs, Priors(skew=skew))
-            error = found.differences.ravel() - TO_DIFFERENCES @ truth.ravel()
-            worst[skew] = max(worst[skew], float(np.abs(error / found.differences_sigma.ravel()).max()))
-    # twice the prior's sigma: three rotations do not determine the skew, six do
-    assert worst[Priors().skew] < sigmas
-    assert worst[0.0] > sigmas  # as it was without the parameter
+        runs, truth = montecarlo.case(seed, Budget(signs=(1, -1), skew_ms=1.0))
+        for rotations, skew in worst:
+            found = estimate_joint(runs[:rotations], Priors(skew=skew))
+            sigmas = montecarlo.worst_sigma(found, truth)
+            worst[rotations, skew] = max(worst[rotations, skew], sigmas)
+    for rotations, limit in limits.items():
+        assert worst[rotations, Priors().skew] < limit
+        assert worst[rotations, 0.0] > limit  # as it was without the parameter
 
 
 def shaken(amplitude_arcsec: float, frequency_hz: float) -> tuple[list[Run], Array]:
@@ -314,6 +306,7 @@ def test_the_scatter_depends_on_the_walk_as_far_as_its_band_allows_for(
     assert found.scatter is not None
     noise_freedom = found.scatter.noise_degrees_of_freedom
     assert noise_freedom == pytest.approx(found.noise.degrees_of_freedom / share**2, rel=0.01)
+    assert found.redundancy.noise_degrees_of_freedom == found.noise.degrees_of_freedom
 
 
 # --- before any data ---

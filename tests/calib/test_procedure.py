@@ -54,9 +54,9 @@ def test_a_prediction_is_shown_before_anyone_lifts_anything(site: Site) -> None:
     predictions = {name: predicted(load(name), site) for name in shipped() if load(name).kind == "arms"}
     rms = {name: np.sqrt(np.trace(predictions[name].covariance) / 9.0) / MM for name in predictions}
 
-    # mathematics, section 4: 0.045 mm rms at most with three rotations; twice as many gain a root of 2, and
-    # determine the skew
-    assert 0.01 < rms["three-rotations"] < 0.045
+    # mathematics, section 4: 0.045 mm rms at most with three rotations; the bound for the default priors is
+    # near 0.03. Twice as many gain a root of 2, and more, as they determine the skew
+    assert 0.02 < rms["three-rotations"] < 0.045
     assert rms["six-rotations"] < rms["three-rotations"] / 2**0.5
     assert predictions["six-rotations"].differences_sigma.shape == (2, 3)
 

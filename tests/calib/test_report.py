@@ -29,7 +29,7 @@ format: imu50-scenario
 version: 1
 seed: 11
 site: {{latitude_deg: 28.2, longitude_deg: 113.0, height_m: 60.0}}
-start: {{pose: {pose}}}
+start: {{pose: {pose}, tilt_mrad: [2, -1]}}
 motion:
   - rest: {{duration_s: 40}}
   - rotate: {{angle_deg: 180, duration_s: 2.5}}

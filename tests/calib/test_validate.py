@@ -34,7 +34,7 @@ from imudrv.ports.base import PortEndedError
 from imudrv.records import Flag, Records
 from imudrv.sim import scenario as scenarios
 from imudrv.sim.capture import record
-from imudrv.sim.scenario import NOMINAL, Rest, Scenario, Segment
+from imudrv.sim.scenario import NOMINAL, Rest, Scenario, Segment, Unit
 from imudrv.sim.unit import simulate
 from imudrv.units import MM
 
@@ -44,10 +44,24 @@ ALIGN_S = 60.0
 """Shorter than in the field: residual biases then leave more in both courses, and the limits still hold."""
 
 
+def identified(unit: Unit, seed: int, *more: str) -> SimulatedUnit:
+    """The unit of a seed, and what the procedure found of it, with rests before the motions of ALIGN_S."""
+    shipped = scenarios.load
+
+    def short_rest(name: str) -> Scenario:
+        _, *motion = shipped(name).motion
+        rest = Segment(rest=Rest(duration_s=ALIGN_S))
+        return shipped(name).model_copy(update={"motion": (rest, *motion)})
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scenarios, "load", short_rest)
+        return subject(unit, seed, procedure=(*simulation.PROCEDURE, *more))
+
+
 @pytest.fixture(scope="module")
 def who() -> SimulatedUnit:
     """A unit with errors, and what the procedure, three half turns, found of its arms."""
-    return subject(scenario("rotation").unit, 1)
+    return identified(scenario("rotation").unit, 1)
 
 
 def short(name: str, after_s: float = 10.0) -> Scenario:
@@ -175,7 +189,7 @@ def test_a_skew_is_estimated_with_a_rocking_and_corrected() -> None:
     made = short("rocking")
     unit = made.unit.model_copy(update={"accelerometer_skew_s": 1e-3})
     made = made.model_copy(update={"unit": unit})
-    who = subject(unit, 2, procedure=(*simulation.PROCEDURE, "rocking"))
+    who = identified(unit, 2, "rocking")
     (skew,) = (n for n in who.result.parameters if n.name == "skew_s")
     assert skew.observable
     assert skew.value == pytest.approx(1e-3, abs=3.0 * skew.sigma)
