@@ -3,7 +3,9 @@
 import json
 import random
 import shutil
+import signal
 import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,7 @@ from imudrv import profiles
 from imudrv.calibration import Calibration, coefficients
 from imudrv.chain import Chain
 from imudrv.cli import main
+from imudrv.files.atomic import atomic_write
 from imudrv.files.settings_file import parse_text
 from imudrv.recording.pack import pack
 from imudrv.recording.reader import Recording
@@ -215,6 +218,35 @@ def test_a_recording_cut_at_a_random_byte_packs_and_opens(live: Path, tmp_path: 
         assert (list(Recording(path).arrivals()), list(map(same, Recording(path).increments()))) == before
         assert not Recording(path).cut
         assert len(samples(path)) == sum(map(len, Recording(path).increments()))
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from imudrv.recording import pack
+
+pack.ChunkedWriter.finish = lambda writer: os.kill(os.getpid(), signal.SIGKILL)
+pack.pack(Path(sys.argv[1]), Path(sys.argv[1]))
+"""
+
+
+def test_a_kill_while_packing_leaves_the_recording_and_the_next_start_removes_the_rest(
+    live: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "recordings"
+    folder.mkdir()
+    path = folder / "run.mcap"
+    shutil.copy(live, path)
+    assert subprocess.run([sys.executable, "-c", KILLED, path]).returncode == -signal.SIGKILL
+    assert path.read_bytes() == live.read_bytes()
+    (left,) = folder.glob(".run.mcap.*")
+    with atomic_write(folder / "other") as file:
+        file.write(b"of a live process")
+        assert not left.exists()
+        (partial,) = folder.glob(".*")
+        assert main(["pack", str(path), "-o", str(folder / "packed.mcap")]) == 0
+        assert partial.exists()
+    assert {one.name for one in folder.iterdir()} == {"run.mcap", "packed.mcap", "other"}
 
 
 NODE = """

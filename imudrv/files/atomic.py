@@ -4,16 +4,20 @@ import hashlib
 import os
 import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Final
 
 from imudrv.errors import InputError
 from imudrv.files.inputs import open_file, reason
+from imudrv.files.lock import FileLock
 from imudrv.files.outputs import file_to_write
+from imudrv.posix import fcntl
 
 MAX_BYTES: Final = 1 << 20
 """Largest settings file, bytes."""
+_PARTIAL: Final = ".imu50-partial"
+"""Suffix of a file that is being written."""
 
 
 def content(path: str | os.PathLike[str], max_bytes: int = MAX_BYTES, kind: str = "a settings file") -> bytes:
@@ -117,6 +121,8 @@ def unchanged(path: str | os.PathLike[str]) -> Iterator[None]:
 def atomic_write(path: Path) -> Iterator[IO[bytes]]:
     """Write a file under another name beside it, and give it its own once it is complete and on the disk.
 
+    What killed processes have left in its folder is removed first.
+
     Parameters
     ----------
     path : Path
@@ -133,10 +139,15 @@ def atomic_write(path: Path) -> Iterator[IO[bytes]]:
         The folder does not exist or cannot be written to, the disk is full, or see `file_to_write`.
     """
     target = file_to_write(path)
+    remove_left_over(target.parent)
     temporary: Path | None = None
     try:
-        with (beside := target.with_name(f".{target.name}.{secrets.token_hex(4)}")).open("xb") as file:
+        beside = target.with_name(f".{target.name}.{secrets.token_hex(4)}{_PARTIAL}")
+        with beside.open("xb") as file:
             temporary = beside
+            if fcntl is not None:
+                with suppress(OSError):  # a file system without locks: what is left stays there
+                    fcntl.flock(file, fcntl.LOCK_EX)
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -151,6 +162,22 @@ def atomic_write(path: Path) -> Iterator[IO[bytes]]:
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
+
+
+def remove_left_over(folder: Path) -> None:
+    """Remove what killed processes have left of `atomic_write` in a folder.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder. The file of a live process stays: it is locked, and Windows removes no open file.
+    """
+    for path in folder.glob(f".*{_PARTIAL}"):
+        with suppress(OSError):
+            if fcntl is None:
+                path.unlink()
+            else:
+                FileLock(path).remove()
 
 
 def sync_folder(folder: Path) -> None:

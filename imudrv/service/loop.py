@@ -29,6 +29,7 @@ from imudrv.calibration import coefficients
 from imudrv.chain import Chain, Output
 from imudrv.diagnosis import LineState
 from imudrv.errors import InputError
+from imudrv.files.atomic import remove_left_over
 from imudrv.hostclock import now_ns
 from imudrv.imu.compensation import LEAVES_OUT_SKEW
 from imudrv.ports import PortEndedError
@@ -453,6 +454,7 @@ class Service:
     def _create_recorder(self, path: Path) -> Recorder:
         if path.is_dir():
             path = path / f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{os.getpid()}.mcap"
+        remove_left_over(path.parent)  # of a run that was killed while it packed its recording
         return Recorder(
             path,
             layout=self._layout,

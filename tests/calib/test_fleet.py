@@ -3,44 +3,19 @@
 import platform
 import sqlite3
 from collections.abc import Sequence
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
 import pytest
 from bench_session import begin
 
-from calib.bench.entries import Decision, SessionEnded
 from calib.bench.session import Session
 from calib.bench.state import RESULT
-from calib.certificate import PROVENANCE_IDENTIFIED, with_lever_arms
 from calib.cli import main
 from calib.fleet.changes import MONTH_DAYS, Measurement, find_changes, unchanged
 from calib.fleet.index import update
-from calib.lever_arms.gauge import LeverArms
-from imudrv.calibration import write_calibration
 from imudrv.errors import InputError
-from imudrv.sim.scenario import NOMINAL
-from imudrv.units import MM
-
-SIGMA_MM = 0.02
-BENCHES = [f"bench {k}" for k in range(1, 6)]
-
-
-def fleet(seed: int, sessions: int = 200, units: int = 25, off_mm: float = 0.0, drift_mm: float = 0.0):
-    """Sessions of units on benches over two years; one bench is off in one axis and one unit drifts."""
-    rng = np.random.default_rng(seed)
-    A = rng.normal(size=(6, 6)) * 0.3 + np.eye(6)
-    P = A @ A.T * SIGMA_MM**2
-    levels = rng.normal(0.0, 20.0, (units, 6))
-    measurements = []
-    for n in range(sessions):
-        unit, bench, t = n % units, int(rng.integers(len(BENCHES))), float(rng.uniform(0, 730))
-        value = levels[unit] + rng.multivariate_normal(np.zeros(6), P)
-        value[1] += off_mm * (bench == 3)
-        value[4] += drift_mm * (unit == 7) * t / MONTH_DAYS
-        measurements.append(Measurement(f"50-{unit:04}", BENCHES[bench], t, value, P))
-    return measurements
+from tools.fleet import fleet, write_session
 
 
 def test_a_bench_that_is_off_and_a_unit_that_drifts_are_found_and_nothing_else() -> None:
@@ -76,23 +51,13 @@ def test_a_bench_whose_units_were_on_no_other_one_cannot_be_judged() -> None:
     assert find_changes(own) == ()
 
 
-BEGUN = datetime(2026, 1, 1, tzinfo=UTC)
-ARMS_MM = np.array([[24.0, -11.0, -9.0], [-23.0, 29.0, -7.0], [-1.0, -18.0, 16.0]])
+ARMS_MM = np.array([47.0, -40.0, -2.0, 25.0, 7.0, -25.0])
 
 
 def session(folder: Path, unit: str, bench: str, days: float, shift_mm: float = 0.0) -> Path:
     """A complete session with a result, without recordings."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    open_session = begin(folder, unit=unit, bench=bench, operator="Li")
-    arms_mm = ARMS_MM + np.array([[shift_mm, 0, 0], [0, 0, 0], [0, 0, 0]])
-    arms = LeverArms(arms_mm * MM, np.eye(9) * (0.01 * MM) ** 2, "given")
-    calibration = NOMINAL.model_copy(update={"serial_number": unit})
-    made = with_lever_arms(calibration, arms, PROVENANCE_IDENTIFIED, {}, BEGUN + timedelta(days=days))
-    write_calibration(folder / RESULT, made)
-    open_session.record_file(RESULT)
-    open_session.append(Decision(True))
-    open_session.end(SessionEnded(None))
-    open_session.close()
+    value = ARMS_MM + np.array([shift_mm, 0.0, 0.0, shift_mm, 0.0, 0.0])
+    write_session(folder, Measurement(unit, bench, days, value, (np.eye(6) + 1.0) * 0.01**2))
     return folder
 
 
