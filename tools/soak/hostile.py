@@ -96,7 +96,7 @@ class _Run:
             if attack is not None:
                 attack.stop()
             self.usage: list[Usage] = monitor.stop()
-            self.code = service.stop()
+            self.code = service.stop(timeout_s=TIMEOUT_S + seconds)  # it packs the recording
             listener.stop()
         self.received: Records = np.load(folder / "received.npy")
         times = np.load(folder / "received.npy.times.npy")

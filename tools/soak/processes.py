@@ -78,10 +78,10 @@ class Child:
         self._reader.join()
         return code
 
-    def stop(self, number: int = signal.SIGTERM) -> int:
+    def stop(self, number: int = signal.SIGTERM, timeout_s: float = TIMEOUT_S) -> int:
         """Send a signal; return the exit code."""
         self.process.send_signal(number)
-        return self.wait()
+        return self.wait(timeout_s)
 
     def close(self) -> None:
         """Kill the process if it still runs."""
