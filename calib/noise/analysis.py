@@ -119,7 +119,8 @@ class NoiseResult:
                 )
             )
         if disturbed := sum(capture.disturbed for capture in self.captures):
-            marks.append(("note", f"left out: motion, missing or flagged samples in {disturbed} places"))
+            places = "1 place" if disturbed == 1 else f"{disturbed} places"
+            marks.append(("note", f"left out: motion, missing or flagged samples in {places}"))
         if self.calibration is None:
             marks.append(
                 ("note", "nominal scale factors of the profile; give the unit's own with --calibration")
