@@ -3,6 +3,8 @@
 tools/run python -m tools.sensors_accuracy units --cases 20
 tools/run python -m tools.sensors_accuracy units --procedure three-loops
 tools/run python -m tools.sensors_accuracy start
+tools/run python -m tools.sensors_accuracy scenario three-loops
+tools/run python -m tools.sensors_accuracy scenario loops-both --temperature
 tools/run python -m tools.sensors_accuracy golden ../shared/data/imusysclbt.bin
 tools/run python -m tools.sensors_accuracy road
 """
@@ -23,6 +25,8 @@ from rich.progress import track
 from rich.table import Table
 
 from calib.identification import PriorCalibration, identify
+from calib.procedure.plan import load as load_procedure
+from calib.procedure.plan import shipped
 from calib.sensors.adjustment import Free
 from calib.sensors.calibrate import SensorsOptions, calibrate_sensors
 from calib.sensors.certificate import certificate
@@ -32,6 +36,7 @@ from imudrv import profiles
 from imudrv.calibration import Calibration
 from imudrv.files.settings_file import parse
 from imudrv.sensor_calibration import number_paths
+from imudrv.sim import scenario as scenarios
 from imudrv.sim.scenario import Scenario
 from imudrv.sim.unit import simulate
 from imudrv.site import Site
@@ -246,6 +251,37 @@ def start(arguments: argparse.Namespace) -> None:
             print(f"{gyro:+.0%} {accelerometer:+.0%}: {max(change):.1e} sigma, {steps} iterations")
 
 
+def scenario(arguments: argparse.Namespace) -> None:
+    """Calibrate the unit of a shipped scenario and compare it with its truth."""
+    layout, played = profiles.load(PROFILE).layout(), scenarios.load(arguments.name)
+    encoder = StreamEncoder(layout)
+    with TemporaryDirectory() as name:
+        path = Path(name) / "session.raw"
+        with path.open("wb") as file:
+            for chunk in simulate(played, layout):
+                file.write(encoder.encode(chunk.pulses).tobytes())
+        result = calibrate_sensors(
+            [path],
+            site=played.site,
+            unit=UNIT,
+            profile=PROFILE,
+            procedure=load_procedure(arguments.name) if arguments.name in shipped() else None,
+            options=SensorsOptions(temperature=arguments.temperature),
+        )
+    print("\n".join(f"{one.mark}: {one.text}" for one in result.verdict))
+    truth = truth_of(played.unit.calibration)
+    stated = sigmas(result)
+    table = Table("", "rms error", "worst", "stated sigma", "worst in sigma")
+    for group, error in errors(result, truth).items():
+        ratio = np.abs(error / stated[group]).max()
+        table.add_row(
+            group, *(f"{x:.4f}" for x in (_rms(error), np.abs(error).max(), _rms(stated[group]), ratio))
+        )
+    Console().print(table)
+    square, freedom = nees(result, truth)
+    print(f"NEES per dimension {square / freedom:.2f} ({freedom} dimensions)")
+
+
 def _off_nominal(gyro: float, accelerometer: float) -> Calibration:
     one = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     return parse(
@@ -348,15 +384,28 @@ def _rotations(seed: int, truth: Calibration, folder: Path) -> list[Path]:
     return captures
 
 
+COMMANDS: Final = (
+    ("units", units),
+    ("start", start),
+    ("scenario", scenario),
+    ("golden", golden),
+    ("road", road),
+)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     commands = parser.add_subparsers(required=True)
-    for name, function in (("units", units), ("start", start), ("golden", golden), ("road", road)):
+    for name, function in COMMANDS:
         command = commands.add_parser(name, help=function.__doc__)
         command.set_defaults(function=function)
         if name == "golden":
             command.add_argument("file", type=Path, help="imusysclbt.bin")
+            continue
+        if name == "scenario":
+            command.add_argument("name", help="shipped scenario, such as three-loops, or a file")
+            command.add_argument("--temperature", action="store_true", help="also the slopes per kelvin")
             continue
         command.add_argument("--seed", type=int, default=1, help="seed of the first unit (default: 1)")
         if name != "start":

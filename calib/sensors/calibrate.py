@@ -402,21 +402,29 @@ def _planned(procedure: Procedure) -> Iterator[tuple[str, Array]]:
 
 
 def named_poses(attitudes: Sequence[Array], procedure: Procedure | None) -> tuple[str, ...]:
-    """Return the name of each rest: that of the nearest pose planned, or the axis that is up."""
-    names = []
+    """Return the name of each rest: that of the nearest pose planned, or the axis that is up.
+
+    A pose that is planned several times, such as the two ends of a loop, is named in the order of the plan.
+    """
+    planned = list(_planned(procedure)) if procedure is not None else []
+    names: list[str] = []
     for C_nb in attitudes:
-        name = pose_of(C_nb)
-        if procedure is not None:
-            near = [(angle(C_nb @ C_bn), planned) for planned, C_bn in _planned(procedure)]
-            distance, planned = min(near)
-            if distance < NEAR_POSE:
-                name = planned
-        names.append(name)
+        distances = [angle(C_nb @ C_bn) for _, C_bn in planned]
+        nearest = min(distances, default=np.inf)
+        same = [
+            name
+            for (name, _), distance in zip(planned, distances, strict=True)
+            if distance < nearest + SAME_POSE
+        ]
+        fresh = [name for name in same if name not in names]
+        names.append((fresh or same)[0] if nearest < NEAR_POSE else pose_of(C_nb))
     return tuple(names)
 
 
 NEAR_POSE: Final = radians(46.0)
 """Angle within which a rest is a pose of the procedure, rad."""
+SAME_POSE: Final = 1e-6
+"""Difference of the angles to two planned poses that are one, rad."""
 
 
 def angle(C: Array) -> float:

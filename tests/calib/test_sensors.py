@@ -11,9 +11,10 @@ import pytest
 from calib.cli import main
 from calib.detection.rest_bins import Noise
 from calib.estimation.dither_line import DitherLine
+from calib.procedure.plan import load as load_procedure
 from calib.procedure.schema import Procedure
 from calib.sensors.adjustment import Free
-from calib.sensors.calibrate import SensorsOptions, calibrate_sensors
+from calib.sensors.calibrate import SensorsOptions, calibrate_sensors, named_poses
 from calib.sensors.calibrate import solve as solve_evidence
 from calib.sensors.certificate import certificate, result_document
 from calib.sensors.evidence import Evidence
@@ -427,6 +428,14 @@ def test_dither_in_the_increments_is_taken_off_the_rates(tmp_path):
     arms = [one for one in found.estimates if one.path.startswith("size_effect")]
     # Without the filter they are wrong by up to 0.3 mm, 21 sigma.
     assert max(abs(one.value - truth[one.path]) / one.sigma for one in arms) < 4.0
+
+
+def test_the_two_ends_of_a_loop_have_their_own_names():
+    for name in ("three-loops", "loops-both"):
+        procedure = load_procedure(name)
+        assert named_poses([rest.C_bn.T for rest in procedure.rests], procedure) == tuple(
+            rest.id for rest in procedure.rests
+        )
 
 
 def test_dither_that_contradicts_the_motions_is_named():

@@ -261,6 +261,22 @@ def test_a_journal_cut_short_at_any_line_is_unfinished(folder: Path) -> None:
         assert main(["verify", str(folder)]) == 3
 
 
+def test_a_certificate_with_a_skew_is_no_fault(tmp_path: Path, accept: Accept) -> None:
+    session = begin(tmp_path / "session")
+    session.close()
+    write_calibration(tmp_path / "skewed.yaml", NOMINAL.model_copy(update={"skew_ms": 0.2}))
+    skewed = Session.create(
+        tmp_path / "another",
+        procedure=session.plan.procedure,
+        calibration=tmp_path / "skewed.yaml",
+        site=session.plan.site,
+        profile="imu50-rs422",
+        port="/dev/ttyUSB0",
+    )
+    skewed.close()
+    assert verify(skewed.folder).faults == ()
+
+
 def test_a_session_at_its_end_without_its_certificate_is_damaged(session: Session) -> None:
     session.end(Decision(False))
     (fault,) = verify(session.folder).faults
