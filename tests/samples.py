@@ -1,6 +1,9 @@
 """Small files that several tests need: the shortest certificate and a short recording."""
 
+import json
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -48,3 +51,14 @@ def record(path: Path, samples: int) -> None:
     recorder.event(5000, "unplugged")
     recorder.calibration(6000, CERTIFICATE.replace("0.5, 0.5, 0.5", "0.6, 0.6, 0.6").encode())
     recorder.close()
+
+
+def parse_json(text: str) -> Any:
+    """JSON as DuckDB and spreadsheets read it: the keys of an object differ in more than their case."""
+
+    def keyed(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+        names = [name.casefold() for name, _ in pairs]
+        assert len(set(names)) == len(names), sorted(name for name, _ in pairs)
+        return dict(pairs)
+
+    return json.loads(text, object_pairs_hook=keyed)

@@ -23,6 +23,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 from realtime import DEADLINE_S, free_port, until
+from samples import parse_json
 
 from imudrv import compensate
 from imudrv.calibration import write_calibration
@@ -697,7 +698,7 @@ def test_a_unit_of_another_maker_is_served_and_healthy(profile: str, tmp_path: P
         until(lambda: service.good() > 6 * second, "six seconds' samples")  # a rate is judged after four
         until(lambda: service.status()["clock"]["locked"], "the clock")
         as_json = service.command("status", "--json")
-        status = json.loads(as_json.stdout)
+        status = parse_json(as_json.stdout)
         assert (as_json.returncode, status["reasons"]) == (0, [])
         assert status["samples"]["lost_last_s"] == 0
         assert status["unit_status"]["faults"] == []

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from realtime import DEADLINE_S
 from rich.console import Console
+from samples import parse_json
 
 from calib.bench.entries import Plan, Signed, from_json
 from calib.bench.journal import Journal, begin
@@ -125,7 +126,7 @@ def journal(folder: Path) -> list[dict[str, Any]]:
     """Complete lines of the journal, which may be growing."""
     path = folder / JOURNAL
     text = path.read_text() if path.exists() else ""
-    return [json.loads(line) for line in text.split("\n")[:-1]]
+    return [parse_json(line) for line in text.split("\n")[:-1]]
 
 
 def until(process: subprocess.Popen[str], true: Callable[[], bool]) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from realtime import DEADLINE_S
-from samples import CERTIFICATE
+from samples import CERTIFICATE, parse_json
 
 import calib
 from calib.cli import main
@@ -89,7 +89,7 @@ def test_captures_become_a_certificate_a_report_and_a_document(
     assert all(len(line) <= 80 for line in printed.splitlines())
     assert "\x1b" not in printed
     new = yaml.safe_load((here / "new.yaml").read_text())
-    document = json.loads((here / "r.json").read_text())
+    document = parse_json((here / "r.json").read_text())
     assert document["rank"] == 6
     assert document["singular_values_m_s_per_m"][5] > 4.0  # 8.8 / T and 15 / T, T = 2.5 s: all six well seen
     sigma = np.sqrt(np.diag(new["size_effect"]["covariance_mm2"])).reshape(3, 3)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 from numpy.typing import NDArray
-from samples import CERTIFICATE
+from samples import CERTIFICATE, parse_json
 
 from calib.cli import main
 from calib.noise.estimates import EstimatesCovariance
@@ -252,7 +252,7 @@ def test_a_rest_gives_its_random_walks_report_and_certificate(
     assert noise(folder / "rest.raw", "--calibration", folder / "unit.yaml", *files) == 0
     said = capsys.readouterr().out
     assert "good" in said
-    channels = json.loads(document.read_text())["channels"]
+    channels = parse_json(document.read_text())["channels"]
     for channel, key, truth in [
         *((one, "angle_random_walk_deg_per_sqrt_h", ARW / DEG_PER_SQRT_H) for one in channels[:3]),
         *((one, "velocity_random_walk_ug_per_sqrt_hz", VRW / UG) for one in channels[3:]),
