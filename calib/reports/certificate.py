@@ -103,9 +103,12 @@ def _document(
             Section(say(message("section_signatures")), tuple(_signatures(particulars, say))),
             *(
                 replace(section, title=say(message("section_annex", title=section.title)))
-                for section in annex
+                for section in annex[:-1]
             ),
-            Section(say(message("section_end")), ()),
+            Section(
+                say(message("section_annex", title=annex[-1].title)),
+                (*annex[-1].blocks, Paragraph(say(message("section_end")))),
+            ),
         ),
     )
 

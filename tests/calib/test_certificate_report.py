@@ -114,7 +114,7 @@ def test_it_has_every_item_and_names_what_is_blank(made: Made) -> None:
         "Left blank, as not stated: address, bench, authorised by.",
     ):
         assert words in text, words
-    assert certificate.sections[-1].title == "End of the certificate"
+    assert certificate.sections[-1].blocks[-1] == Paragraph("End of the certificate.")
     assert 'content: "50-0017-20261126-0123abcd"' in page
     assert "counter(page)" in page
     assert '<div class="watermark">SIMULATED</div>' in page

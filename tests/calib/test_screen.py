@@ -17,7 +17,16 @@ from rich.console import Console
 
 from calib.bench import block_letters
 from calib.bench.keys import Keyboard
-from calib.bench.screen import NO_DATA, NO_FRAMES, OperatorScreen, large_text, plain, screen, with_port_state
+from calib.bench.screen import (
+    NO_DATA,
+    NO_FRAMES,
+    OperatorScreen,
+    large_text,
+    plain,
+    screen,
+    tone,
+    with_port_state,
+)
 from calib.messages import english, message, verbatim
 from calib.procedure.events import Abort, Confirm, Phase, Redo, Skip, View
 from imudrv.diagnosis import LineState
@@ -169,6 +178,7 @@ def test_what_is_wrong_with_the_line_is_shown_and_without_samples_it_is_the_head
     state: LineState, line: str
 ) -> None:
     shown = with_port_state(view(), state)
+    assert tone(shown) == ("bad" if state.trouble else "do")
     assert plain(shown).endswith(f"place: {line}")
     assert state.trouble in "\n".join(rows(shown))
 
