@@ -22,7 +22,8 @@ from calib.procedure.plan import load
 from imudrv.errors import InputError
 from imudrv.terminal import console
 
-ASKED = re.compile(r"PRESS ENTER|REJECTED|\[y/n\]|step 1 of 1")  # the last: the verification, which is left
+ASKED = re.compile(r"PRESS ENTER|REJECTED|\[y/n\]|step 1 of 1:(?!.*\[y/n\]).*\n")
+"""The last: the verification, which is left, once it asks for no answer."""
 
 
 def practised(folder: Path, mistakes: str) -> tuple[int, str]:
@@ -48,7 +49,7 @@ def practised(folder: Path, mistakes: str) -> tuple[int, str]:
         except OSError:  # the end, on a pty
             break
         for asked in ASKED.finditer(shown[answered:]):
-            answer = b"y" if asked[0] == "[y/n]" else b"q" if asked[0] == "step 1 of 1" else b"\n"
+            answer = b"y" if asked[0] == "[y/n]" else b"q" if asked[0].startswith("step") else b"\n"
             os.write(master, answer)
         answered = max(answered, shown.rfind("\n"))
     os.close(master)
