@@ -97,8 +97,7 @@ def read_rests(rests: Sequence[RestSamples], A: Array, pulse: Array, walk: float
     Readings
     """
     first, parts = rests[0], []
-    swing = np.array([vibration(first.t_s, dv) for dv in first.dv_a.T])
-    shaken = np.maximum(swing - pulse**2 / 12.0, 0.0) * (pulse > 0.0)
+    shaken = beyond_pulses(first.t_s, first.dv_a, pulse)
     edge = (EDGE_SHARE * pulse) ** 2 + shaken
     for k, rest in enumerate(rests):
         after, before = k > 0, k + 1 < len(rests)
@@ -113,6 +112,26 @@ def read_rests(rests: Sequence[RestSamples], A: Array, pulse: Array, walk: float
     turn = (TURN_SHARE * pulse) ** 2 + np.minimum(shaken, pulse**2 / 12.0) * _squared_rate(rests)
     least = np.maximum(variance, LEAST_VARIANCE)
     return Readings(t_s, arrest, direction_n, v, least, M * start @ M.T, M * turn @ M.T)
+
+
+def beyond_pulses(t_s: Array, dv_a: Array, pulse: Array) -> Array:
+    """Return the mean square of the vibration of each accelerometer beyond that of its pulses, (m/s)^2.
+
+    Parameters
+    ----------
+    t_s : ndarray, shape (n,)
+        End of each sample, at rest.
+    dv_a : ndarray, shape (n, 3)
+        Increments on the sensing axes, m/s.
+    pulse : ndarray, shape (3,)
+        Velocity of one pulse, m/s; 0: not quantised, and the result is 0.
+
+    Returns
+    -------
+    ndarray, shape (3,)
+    """
+    swing = np.array([vibration(t_s, dv) for dv in dv_a.T])
+    return np.asarray(np.maximum(swing - pulse**2 / 12.0, 0.0) * (pulse > 0.0), np.float64)
 
 
 def level_channels(up_a: Array) -> list[int]:

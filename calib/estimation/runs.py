@@ -24,7 +24,7 @@ from calib.estimation.dither_line import DitherLine, dither_lines
 from calib.estimation.low_pass import FilterChoice, chosen_filter, low_passed, weights, without_dither
 from calib.estimation.priors import Priors
 from calib.estimation.pulses import without_quantisation
-from calib.estimation.readings import Readings, RestSamples, level_channels, read_rests
+from calib.estimation.readings import Readings, RestSamples, beyond_pulses, level_channels, read_rests
 from calib.estimation.rigid_motion import rigid_motion
 from calib.estimation.walk import WalkEstimate, random_walk
 from imudrv.arrays import Array
@@ -398,11 +398,16 @@ class _RunBuilder:
         )
 
     def _correction(self, samples: Records, dv_a: Array, q_nb: Array, A: Array) -> Array:
-        """Return what the velocity is to be corrected by for the fractions of pulses, m/s, in n."""
+        """Return what the velocity is to be corrected by for the fractions of pulses, m/s, in n.
+
+        Where the case vibrates by more than they are, they change in every sample, and their mean is right.
+        """
         pulse = self._setup.pulses.accelerometer
         t_s, C_nb = self._time(samples["counter"]), _matrices(q_nb)
         corrected = np.zeros_like(dv_a)
-        for i in np.flatnonzero(pulse):
+        before = slice(self._turns[0].start - self._begin)
+        shaken = beyond_pulses(t_s[before], dv_a[before], pulse)
+        for i in np.flatnonzero((pulse > 0.0) & (shaken < pulse**2 / 12.0)):
             motion = rigid_motion(t_s, C_nb, samples["dtheta_b"], A[i], self._setup.site.gravity)
             corrected[:, i] = without_quantisation(t_s, dv_a[:, i], float(pulse[i]), motion) - dv_a[:, i]
         middle = 0.5 * (C_nb + np.concatenate([C_nb[:1], C_nb[:-1]])) @ self._setup.C_ba

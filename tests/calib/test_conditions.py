@@ -11,6 +11,7 @@ from calib.estimation.channel import channel
 from calib.estimation.joint import estimate_joint
 from calib.estimation.priors import Priors, certified_priors
 from calib.estimation.pulses import without_quantisation
+from calib.estimation.readings import RestSamples, read_rests
 from calib.estimation.result import LeverArmEstimate
 from calib.estimation.rigid_motion import rigid_motion
 from calib.estimation.runs import navigate_rotations
@@ -175,3 +176,27 @@ def test_the_motion_between_two_pulses_is_that_of_a_rigid_body() -> None:
     error = (smooth - v)[turning]
     assert error.std() < 0.02 * pulse
     assert (np.cumsum(increments) - v)[turning].std() > 0.2 * pulse
+
+
+@pytest.mark.parametrize(("turn_s", "tau"), [(2.5, 1e-3), (1.0, 1e-3), (2.5, 5e-3)])
+def test_what_a_shaken_accelerometer_leaves_in_a_turn_is_as_derived(turn_s: float, tau: float) -> None:
+    pulse, t = 5e-4, tau * np.arange(1, round((4.0 + turn_s) / tau) + 1)
+    u = np.clip((t - 2.0) / turn_s, 0.0, 1.0)
+    angle = np.pi * u**3 * (10.0 - 15.0 * u + 6.0 * u * u)
+    turning, before, after = (u > 0.0) & (u < 1.0), t < 2.0, t > 2.0 + turn_s
+    left = []
+    for seed in range(1000, 1040):
+        rng = np.random.default_rng(seed)
+        v = 0.1 * rng.standard_normal() * np.sin(angle) + rng.uniform(-0.05, 0.05) * t  # arms, and a lean
+        v += 5e-5 * tau**0.5 * np.cumsum(rng.standard_normal(len(t)))
+        lines = [np.sin(2.0 * np.pi * (f * t + rng.random())) for f in (400.0, 392.0, 412.0)]
+        v += pulse * np.sum(lines, axis=0)
+        increments = counted(v, pulse)
+        error = np.cumsum(increments) - v
+        error -= error[~turning].mean()
+        left.append([error @ np.gradient(x) for x in (np.sin(angle), np.cos(angle))])
+    dv_a = np.tile(increments[:, None], 3)
+    rests = [RestSamples(t[at], np.zeros((at.sum(), 3)), dv_a[at], np.eye(3)) for at in (before, after)]
+    stated = read_rests(rests, np.eye(3), np.full(3, pulse), 5e-5).turn[0, 0]
+    # 40 draws of two: 11 %, and sampled lines are not quite independent from sample to sample
+    assert np.sqrt(np.square(left).sum(axis=1).mean() / stated) == pytest.approx(1.0, abs=0.35)
