@@ -55,6 +55,7 @@ class WebConsole:
     """
 
     def __init__(self, session: Session, address: str, language: str) -> None:
+        self._session = session
         self._actions: SimpleQueue[dict[str, Any]] = SimpleQueue()
         page = resources.files(__package__).joinpath("page")
         self._server = PageServer(
@@ -120,7 +121,8 @@ class WebConsole:
 
     def end(self, outcome: Sequence[Message]) -> None:
         """Show how the session has ended."""
-        self._keep("end", {"lines": [_texts(line) for line in outcome]})
+        is_reported = set(REPORTS.values()) <= self._session.files.keys()
+        self._keep("end", {"lines": [_texts(line) for line in outcome], "report": is_reported})
 
     def close(self) -> None:
         """End the server."""

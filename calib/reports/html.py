@@ -8,10 +8,13 @@ from string import Template
 from typing import Final
 
 from calib.messages import message, text
-from calib.reports.document import MARK_NAMES, Block, Document, Figure, KeyValues, Paragraph
+from calib.reports.document import MARK_NAMES, Block, Document, Figure, KeyValues, Paragraph, Section
 
 LONG: Final = 15
 """A table of more rows may be broken by a page's end."""
+
+MOST_TOGETHER: Final = 5
+"""A section of more paragraphs may be, too."""
 
 
 def as_html(document: Document, number: str = "", watermark: str = "", language: str = "en") -> str:
@@ -33,11 +36,7 @@ def as_html(document: Document, number: str = "", watermark: str = "", language:
     str
         The file.
     """
-    body = "\n".join(
-        f"<section>\n<h2>{escape(section.title)}</h2>\n"
-        f"{''.join(_marked_up(block, language) for block in section.blocks)}</section>"
-        for section in document.sections
-    )
+    body = "\n".join(_section(section, language) for section in document.sections)
     page = Template(resources.files(__package__).joinpath("page.html").read_text("utf-8"))
     counters = {"page": '" counter(page) "', "pages": '" counter(pages) "'}
     return page.substitute(
@@ -49,6 +48,13 @@ def as_html(document: Document, number: str = "", watermark: str = "", language:
         watermark=f'<div class="watermark">{escape(watermark)}</div>' if watermark else "",
         body=body,
     )
+
+
+def _section(section: Section, language: str) -> str:
+    is_text = all(isinstance(block, Paragraph) for block in section.blocks)
+    kind = ' class="short"' if is_text and len(section.blocks) <= MOST_TOGETHER else ""
+    blocks = "".join(_marked_up(block, language) for block in section.blocks)
+    return f"<section{kind}>\n<h2>{escape(section.title)}</h2>\n{blocks}</section>"
 
 
 def _marked_up(block: Block, language: str) -> str:

@@ -5,7 +5,7 @@ const token = new URLSearchParams(location.search).get("token") || "";
 const SIZE = [150, 200, 100];  // of the unit along X, Y, Z, px
 const KEPT = 1200;             // frames in the plots: 60 s at 20 Hz
 const TONES = { good: 880, bad: 196, ready: 660, turn: 523 };
-let hello = null, view = null, result = null, acting = false, ended = false, asked = null, socket = null;
+let hello = null, view = null, result = null, lines = [], acting = false, ended = false, asked = null, socket = null;
 let language = "en", sounds = true, audio = null, bells = null, wasReady = false, wasActing = false;
 const done = new Set();  // steps that were accepted; the verification is a procedure of its own
 const history = { rate: [], force: [], stillness: [] };
@@ -144,6 +144,7 @@ function drawText() {
   $("big").classList.toggle("rejected", Boolean(rejected) && !lost);
   $("big").dataset.tone = lost ? "bad" : ended ? "good" : view ? view.tone : "wait";
   $("report").href = `${hello.reports[language]}?token=${encodeURIComponent(token)}`;
+  $("lines").textContent = lines.map(inLanguage).join("\n");
   if (asked) $("asked").textContent = inLanguage(hello.questions[asked.action]);
 }
 function drawSteps() {
@@ -231,7 +232,11 @@ const taken = {
     const first = view === null || ended;
     ended = false;
     view = content;
-    if (first) drawResult();
+    if (first) {
+      lines = [];
+      $("report").hidden = true;
+      drawResult();
+    }
     frame();
   },
   acting(content) {
@@ -249,10 +254,10 @@ const taken = {
   },
   end(content) {
     ended = true;
+    lines = content.lines;
+    $("report").hidden = !content.report;
     draw();
     drawResult();
-    $("lines").textContent = content.lines.map(inLanguage).join("\n");
-    $("report").hidden = false;
   },
 };
 function connect() {
@@ -313,9 +318,8 @@ function fit() {
   const scene = $("scene");
   $("world").style.setProperty("--scale", Math.min(scene.clientWidth / 500, scene.clientHeight / 470));
 }
-addEventListener("resize", fit);
+new ResizeObserver(fit).observe($("scene"));  // which is also hidden and shown again
 const wanted = localStorage.getItem("theme")
   || (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
 document.documentElement.dataset.theme = wanted;
-fit();
 connect();
