@@ -32,9 +32,7 @@ def add_workers(parser: argparse.ArgumentParser) -> None:
     where = parser.add_mutually_exclusive_group()
     text = "processes on this computer (default: 1; more need pip install imu50[dask])"
     where.add_argument("--workers", type=int, default=1, metavar="N", help=text)
-    text = (
-        "Dask scheduler whose workers do it, such as tcp://host:8786; with the same software and paths"
-    )
+    text = "Dask scheduler whose workers do it, such as tcp://host:8786; with the same software and paths"
     where.add_argument("--scheduler", metavar="URL", help=text)
 
 
