@@ -35,13 +35,14 @@ from calib.sensors.result import SensorsResult
 from imudrv import profiles
 from imudrv.calibration import Calibration
 from imudrv.files.settings_file import parse
+from imudrv.imu.coefficients import Coefficients
 from imudrv.sensor_calibration import number_paths
 from imudrv.sim import scenario as scenarios
 from imudrv.sim.scenario import Scenario
-from imudrv.sim.unit import simulate
+from imudrv.sim.unit import draw_true_unit, simulate
 from imudrv.site import Site
 from imudrv.terminal import guarded
-from imudrv.units import ARCSEC
+from imudrv.units import ARCSEC, DEG_PER_H, PPM, UG
 from imudrv.wire.encode import StreamEncoder
 from tools.psins_to_wire import FLOAT_PROFILE, convert
 from tools.sensors_units import FACES, SITE, new_unit, six_faces_turned, three_loops, write_session
@@ -269,7 +270,7 @@ def scenario(arguments: argparse.Namespace) -> None:
             options=SensorsOptions(temperature=arguments.temperature),
         )
     print("\n".join(f"{one.mark}: {one.text}" for one in result.verdict))
-    truth = truth_of(played.unit.calibration)
+    truth = _at_temperature(truth_of(played.unit.calibration), draw_true_unit(played, layout), result)
     stated = sigmas(result)
     table = Table("", "rms error", "worst", "stated sigma", "worst in sigma")
     for group, error in errors(result, truth).items():
@@ -280,6 +281,29 @@ def scenario(arguments: argparse.Namespace) -> None:
     Console().print(table)
     square, freedom = nees(result, truth)
     print(f"NEES per dimension {square / freedom:.2f} ({freedom} dimensions)")
+
+
+def _at_temperature(truth: dict[str, float], drawn: Coefficients, result: SensorsResult) -> dict[str, float]:
+    """Return the truth at the reference temperature of a result, with the slopes that were drawn."""
+    terms, kelvin = drawn.temperature, 0.0
+    if terms is None:
+        return truth
+    if np.isfinite(result.reference_degc):
+        kelvin = result.reference_degc - terms.reference_degc
+    truth = dict(truth)
+    for k in range(3):
+        truth[f"gyro.bias_deg_per_h[{k}]"] += terms.gyro_bias[k] / DEG_PER_H * kelvin
+        truth[f"gyro.scale_arcsec_per_pulse[{k}]"] *= 1.0 + terms.gyro_scale[k] * kelvin
+        truth[f"accelerometer.bias_ug[{k}]"] += terms.accelerometer_bias[k] / UG * kelvin
+        truth[f"accelerometer.scale_pulse_per_m_s[{k}]"] *= 1.0 + terms.accelerometer_scale[k] * kelvin
+        slopes = {
+            "gyro_bias_deg_per_h_per_k": terms.gyro_bias[k] / DEG_PER_H,
+            "gyro_scale_ppm_per_k": terms.gyro_scale[k] / PPM,
+            "accelerometer_bias_ug_per_k": terms.accelerometer_bias[k] / UG,
+            "accelerometer_scale_ppm_per_k": terms.accelerometer_scale[k] / PPM,
+        }
+        truth |= {f"temperature.{name}[{k}]": float(slope) for name, slope in slopes.items()}
+    return truth
 
 
 def _off_nominal(gyro: float, accelerometer: float) -> Calibration:

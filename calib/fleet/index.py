@@ -205,6 +205,8 @@ def _insert(database: sqlite3.Connection, tree: Path, folder: str, digest: str) 
 
 def _fault(session: SessionState) -> str:
     """Return why a session does not count; empty if it does."""
+    if session.procedure().kind == "noise":
+        return "a session of the noise: nothing of its certificate was measured again"
     decision = session.stage(Decision)
     if RESULT not in session.files or decision is None or not decision.accepted:
         return "no accepted result"

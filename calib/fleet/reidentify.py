@@ -79,6 +79,8 @@ def reidentify(folder: Path) -> Reidentified:
     try:
         session = SessionState(folder, journal.read(folder / JOURNAL).entries)
         unit = session.plan.unit
+        if not session.procedure().runs:
+            return Reidentified(folder, unit, fault="not a session of the lever arms")
         if RESULT not in session.files:
             return Reidentified(folder, unit, fault="no certificate")
         before = convert(lever_arms_of(read_calibration(session.path(RESULT)), RESULT), "x")
