@@ -170,13 +170,14 @@ def remove_left_over(folder: Path) -> None:
     Parameters
     ----------
     folder : Path
-        The folder. The file of a live process stays: it is locked, and Windows removes no open file.
+        The folder. The file of a live process stays: it is locked, or still empty. Where the system has no
+        such locks, all stay.
     """
+    if fcntl is None:
+        return
     for path in folder.glob(f".*{_PARTIAL}"):
         with suppress(OSError):
-            if fcntl is None:
-                path.unlink()
-            else:
+            if path.stat().st_size:
                 FileLock(path).remove()
 
 

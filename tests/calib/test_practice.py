@@ -3,7 +3,6 @@
 import json
 import os
 import pty
-import re
 import select
 import subprocess
 import sys
@@ -22,8 +21,14 @@ from calib.procedure.plan import load
 from imudrv.errors import InputError
 from imudrv.terminal import console
 
-ASKED = re.compile(r"PRESS ENTER|REJECTED|\[y/n\]|step 1 of 1:(?!.*\[y/n\]).*\n")
-"""The last: the verification, which is left, once it asks for no answer."""
+
+def key_for(line: str) -> bytes:
+    """The key that a line asks for; the verification is left."""
+    if "[y/n]" in line:
+        return b"y"
+    if "step 1 of 1:" in line:
+        return b"q"
+    return b"\n" if "PRESS ENTER" in line or "REJECTED" in line else b""
 
 
 def practised(folder: Path, mistakes: str) -> tuple[int, str]:
@@ -48,10 +53,12 @@ def practised(folder: Path, mistakes: str) -> tuple[int, str]:
             shown += os.read(master, 65536).decode(errors="replace")
         except OSError:  # the end, on a pty
             break
-        for asked in ASKED.finditer(shown[answered:]):
-            answer = b"y" if asked[0] == "[y/n]" else b"q" if asked[0].startswith("step") else b"\n"
-            os.write(master, answer)
-        answered = max(answered, shown.rfind("\n"))
+        for line in shown[answered:].splitlines(keepends=True):
+            if line.endswith("\n") or "[y/n]" in line:  # a prompt has no end of line
+                answered += len(line)
+                if key := key_for(line):
+                    answer = key
+                    os.write(master, key)
     os.close(master)
     limit.cancel()
     return process.wait(timeout=DEADLINE_S), shown

@@ -84,6 +84,6 @@ def check_status(_: Setup, data: bytes, __: Cuts) -> None:
                     code = main([*arguments, "--status", str(path)])
                 assert code != OUR_FAULT, printed.getvalue()
             with contextlib.suppress(InputError):
-                monitor(path, Console(file=io.StringIO()))
+                monitor(path, Console(file=io.StringIO()), "en")
         finally:
             server.close()
