@@ -34,7 +34,7 @@ from imudrv.service.serve import AT_ONCE, DescriptorLoop, Served, Why
 from imudrv.service.settings import Settings
 from imudrv.sim.scenario import NOMINAL
 from imudrv.sinks.backlog import Backlog
-from imudrv.sinks.base import Batch, Outlet, Sink, SinkState
+from imudrv.sinks.base import HOUSEKEEPING_NS, Batch, Outlet, Sink, SinkState
 from imudrv.units import NS_PER_S
 from imudrv.wire.datagram import SIZE
 from imudrv.wire.encode import CanEncoder, StreamEncoder
@@ -345,7 +345,7 @@ def test_the_end_of_a_can_bus_comes_after_its_last_messages(bus: Line) -> None:
 class Collected(Sink):
     """Keeps increments."""
 
-    is_patient = True
+    patience_ns = HOUSEKEEPING_NS
 
     def __init__(self) -> None:
         super().__init__("own")

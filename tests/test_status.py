@@ -15,11 +15,12 @@ from imudrv.errors import InputError
 from imudrv.hostclock import now_ns
 from imudrv.profiles import load
 from imudrv.records import PULSES
-from imudrv.service.loop import HOUSEKEEPING_NS, Service
+from imudrv.service.loop import Service
 from imudrv.service.settings import Settings
 from imudrv.service.status import Status, UnitStatus
 from imudrv.service.status_socket import StatusServer, ask
 from imudrv.sim.scenario import NOMINAL
+from imudrv.sinks.base import HOUSEKEEPING_NS
 from imudrv.units import NS_PER_S
 from imudrv.wire.encode import StreamEncoder
 

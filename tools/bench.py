@@ -289,14 +289,15 @@ def show(measures: list[Measure], how: str) -> None:
     console.print(f"One core, {how}, best round. Samples, own and alternative: {counts}.")
 
 
-def show_live(quantiles: dict[str, dict[str, float]]) -> None:
+def show_live(rows: dict[str, dict[str, float]]) -> None:
     """Print a table."""
-    table = Table("latency from unit to receiver", *next(iter(quantiles.values())))
-    for which, row in quantiles.items():
-        units = {name: f"{x:.2f}" if "/" in which else f"{x * 1e6:.0f} us" for name, x in row.items()}
-        if "cpu" in row:
-            units["cpu"] = f"{100 * row['cpu']:.1f} %"
-        table.add_row(which, *units.values())
+    table = Table("latency from unit to receiver", *next(iter(rows.values())))
+    for which, row in rows.items():
+        if "/" in which:
+            table.add_row(which, *(f"{ratio:.2f}" for ratio in row.values()))
+        else:
+            *quantiles_s, cpu = row.values()
+            table.add_row(which, *(f"{x * 1e6:.0f} us" for x in quantiles_s), f"{100 * cpu:.1f} %")
     Console().print(table)
 
 

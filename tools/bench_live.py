@@ -216,15 +216,19 @@ def samples(count: int) -> Records:
     return pulses
 
 
-def play(unit: Line | Bus, sent_ns: NDArray[np.int64]) -> None:
-    """Write a sample each millisecond and store the time."""
+def play(unit: Line | Bus, sent_ns: NDArray[np.int64], process: int) -> float:
+    """Write a sample each millisecond, store the time, and return the part of a core that a process took."""
     frames = unit.samples(len(sent_ns))
     begin = time.monotonic() + 0.1
+    begin_s = 0.0
     for k, messages in enumerate(frames):
+        if k == SETTLE:
+            begin_s = cpu_seconds(process)
         time.sleep(max(0.0, begin + k * TAU_S - time.monotonic()))
         sent_ns[k] = time.monotonic_ns()
         for message in messages:
             unit.write(message)
+    return (cpu_seconds(process) - begin_s) / ((len(frames) - SETTLE) * TAU_S)
 
 
 def receive(inlet: socket.socket, echo: Echo, received_ns: NDArray[np.int64]) -> None:
@@ -287,9 +291,9 @@ def command(which: str, unit: Line | Bus, port: int, folder: Path) -> list[str]:
 
 
 def cpu_seconds(process: int) -> float:
-    """Return the processor time of a process so far, all threads."""
-    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    """Return the processor time of a process so far, all threads that it has."""
+    spent = [path.read_text().split()[0] for path in Path(f"/proc/{process}/task").glob("*/schedstat")]
+    return sum(map(int, spent)) * 1e-9  # /proc/PID/stat has ticks of 10 ms
 
 
 def one_round(transport: type[Line] | type[Bus], samples: int, which: str, folder: Path) -> Round:
@@ -314,10 +318,8 @@ def one_round(transport: type[Line] | type[Bus], samples: int, which: str, folde
         np.save(folder / "received.npy", received_ns)
         os._exit(0)
     sent_ns = np.zeros(samples, np.int64)
-    before_s = cpu_seconds(middle.pid)
     with frozen_gc():
-        play(unit, sent_ns)
-    cpu = (cpu_seconds(middle.pid) - before_s) / (samples * TAU_S)
+        cpu = play(unit, sent_ns, middle.pid)
     os.waitpid(listener, 0)
     middle.send_signal(signal.SIGTERM)
     middle.wait()
@@ -345,8 +347,8 @@ def live(transport: type[Line] | type[Bus], seconds: int, rounds: int) -> dict[s
     -------
     dict
         Of each contestant quantiles of the latency, s, and the part of a core that it took, each the median
-        over its rounds, so that a disturbance of one round does not decide; and the ratios of the quantiles
-        to those of the first one.
+        over its rounds, so that a disturbance of one round does not decide; and the ratios to those of the
+        first one.
     """
     if seconds * 1000 > 1 << 16:
         raise SystemExit("expected rounds of 65 s at most: a counter of 16 bits repeats itself")
@@ -365,6 +367,7 @@ def live(transport: type[Line] | type[Bus], seconds: int, rounds: int) -> dict[s
         result[which]["cpu"] = float(np.median([one.cpu for one in all_rounds]))
     first = next(iter(taken))
     for which in list(taken)[1:]:
-        ratios = {name: result[which][name] / result[first][name] for name in quantiles}
-        result[f"{which} / {first}"] = ratios
+        result[f"{which} / {first}"] = {
+            name: value / result[first][name] for name, value in result[which].items()
+        }
     return result

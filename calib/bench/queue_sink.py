@@ -7,7 +7,7 @@ from concurrent.futures import Future, wait
 from queue import Empty, SimpleQueue
 from typing import Final
 
-from imudrv.sinks.base import Batch, Sink, SinkState
+from imudrv.sinks.base import HOUSEKEEPING_NS, Batch, Sink, SinkState
 
 TIMEOUT_S: Final = 0.2
 """Longest wait for the next item."""
@@ -36,7 +36,7 @@ class QueueSink(Sink):
         Whether the service has ended; waiting items can still be taken.
     """
 
-    is_patient = True
+    patience_ns = HOUSEKEEPING_NS
 
     def __init__(self, most: int | None) -> None:
         super().__init__("bench")

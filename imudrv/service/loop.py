@@ -2,8 +2,8 @@
 
 One thread reads, stamps, decodes, compensates and publishes, driven by samples and not by a timer. What the
 system has held back arrives as one batch and is processed as one. Everything else is done between two reads:
-eight times a second, since Python's code leaves cold caches to the sample after it, and more often while an
-output is behind.
+four times a second, since Python's code leaves cold caches to the sample after it; eight times while a file
+is written, and more often while an output is behind.
 
 A port with a descriptor is served by a kernel (`imudrv.service.serve`), which returns for all that is not a
 read, its samples and their datagrams. Other ports are read by Python. Both use the kernels of `imudrv.chain`.
@@ -56,16 +56,14 @@ from imudrv.service.status_socket import StatusServer, default_status_path
 from imudrv.service.warm_up import warm_up
 from imudrv.signals import SIGHUP
 from imudrv.sinks import open_sink
-from imudrv.sinks.base import Batch, Sink
+from imudrv.sinks.base import HOUSEKEEPING_NS, ON_DISK_NS, Batch, Sink
 from imudrv.sinks.history import History
 from imudrv.sinks.recorder import Recorder
 from imudrv.units import NS, NS_PER_S
 
-HOUSEKEEPING_NS: Final = NS_PER_S // 8
-"""Time between two rounds of housekeeping; with the 50 ms of the writing thread it leaves a recording that is
-complete up to 0.25 s ago."""
 POLL_NS: Final = NS_PER_S // 50
-"""The same while an output has samples queued, and the longest wait of Python for data."""
+"""Time between two rounds of housekeeping while an output has samples queued, and the longest wait of Python
+for data."""
 
 
 class Service:
@@ -234,7 +232,7 @@ class Service:
         if now >= self._next_poll_ns:
             self._poll(now)
             is_behind = any(sink.state.queued for sink in self._sinks)
-            self._next_poll_ns = now + (POLL_NS if is_behind else HOUSEKEEPING_NS)
+            self._next_poll_ns = now + (POLL_NS if is_behind else self._patience_ns)
         return True
 
     def close(self) -> Path | None:
@@ -290,6 +288,11 @@ class Service:
         self._wake()
         return done
 
+    @property
+    def _patience_ns(self) -> int:
+        patience_ns = [sink.patience_ns for sink in self._sinks if sink.patience_ns]
+        return min([ON_DISK_NS if self._recordings.are_on else HOUSEKEEPING_NS, *patience_ns])
+
     def _wake(self) -> None:
         if self._descriptor_loop is not None:
             self._descriptor_loop.pipe.wake()
@@ -307,7 +310,7 @@ class Service:
             self._next_poll_ns,
             clocks,
             [outlet for some in outlets for outlet in some],
-            not all(sink.is_patient for sink in self._sinks),
+            not all(sink.patience_ns for sink in self._sinks),
         )
         if len(served.reads):
             self._take(served, [len(some) for some in outlets])

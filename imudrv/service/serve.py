@@ -17,7 +17,7 @@ is unusual is left to Python, which handles it as it does for a port without a d
 stages:
 
     reason        returned when                               Python then
-    HOUSEKEEPING  its time is over, 0.13 s                    does the housekeeping
+    HOUSEKEEPING  its time is over, 0.25 or 0.13 s            does the housekeeping
     SIGNAL        a signal came                               runs its handler
     WOKEN         a signal or another thread woke it          does what is asked for
     CLOCKS        the host's clock was set, or the host slept compares the clocks, and reads the port

@@ -2,9 +2,16 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, Final, NamedTuple
 
 from imudrv.records import Records
+from imudrv.units import NS_PER_S
+
+HOUSEKEEPING_NS: Final = NS_PER_S // 4
+"""Time between two rounds of the live loop's housekeeping."""
+ON_DISK_NS: Final = NS_PER_S // 8
+"""The same while a file is written; with the 50 ms of the writing thread it leaves one that is complete up to
+0.25 s ago."""
 
 
 class Batch(NamedTuple):
@@ -104,12 +111,11 @@ class Sink(ABC):
 
     Attributes
     ----------
-    is_patient : bool
-        Whether `publish` may be called up to 0.13 s after a batch arrived; otherwise it is called at once,
-        which costs the loop time.
+    patience_ns : int
+        How long after a batch arrived `publish` may be called; 0: at once, which costs the loop time.
     """
 
-    is_patient: ClassVar[bool] = False
+    patience_ns: ClassVar[int] = 0
 
     def __init__(self, url: str) -> None:
         self.url = url
@@ -128,7 +134,7 @@ class Sink(ABC):
         Parameters
         ----------
         batch : Batch
-            The samples, up to 0.13 s old.
+            The samples, as old as `patience_ns`.
         outlets : list of Written
             One for each of `outlets`.
         """
@@ -137,7 +143,7 @@ class Sink(ABC):
     def poll(self) -> None:
         """Accept clients, send what is queued, reopen devices.
 
-        Called eight times a second, and fifty times while `state` has samples in the queue.
+        Called at least four times a second, and fifty times while `state` has samples in the queue.
         """
         return
 

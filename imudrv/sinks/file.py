@@ -12,7 +12,7 @@ from imudrv.errors import InputError
 from imudrv.files.spool import AppendThread, Piece
 from imudrv.files.tables import CsvTable, increment_columns
 from imudrv.records import Records
-from imudrv.sinks.base import Batch, Sink, SinkState
+from imudrv.sinks.base import ON_DISK_NS, Batch, Sink, SinkState
 
 LIMIT: Final = 16_384
 """Maximum number of queued samples."""
@@ -33,7 +33,7 @@ class FileSink(Sink):
         Another suffix, an existing file, or a folder that cannot be written to.
     """
 
-    is_patient = True
+    patience_ns = ON_DISK_NS
 
     def __init__(self, url: str) -> None:
         super().__init__(url)

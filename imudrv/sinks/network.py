@@ -10,7 +10,7 @@ from typing import Any, Final, TypeAlias
 from imudrv.errors import InputError
 from imudrv.loopback import LOOPBACK
 from imudrv.sinks.backlog import Backlog
-from imudrv.sinks.base import Batch, Outlet, Sink, SinkState, Written
+from imudrv.sinks.base import HOUSEKEEPING_NS, Batch, Outlet, Sink, SinkState, Written
 from imudrv.url import host_and_port, split
 from imudrv.wire.datagram import SIZE
 
@@ -43,7 +43,7 @@ class UdpSink(Sink):
         The address is not valid.
     """
 
-    is_patient = True
+    patience_ns = HOUSEKEEPING_NS
 
     def __init__(self, url: str) -> None:
         super().__init__(url)
@@ -198,7 +198,7 @@ class TcpSink(Sink):
         The address is not valid or cannot be used.
     """
 
-    is_patient = True
+    patience_ns = HOUSEKEEPING_NS
 
     def __init__(self, url: str) -> None:
         super().__init__(url)

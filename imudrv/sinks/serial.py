@@ -13,7 +13,7 @@ from imudrv.ports.serial import explain
 from imudrv.posix import require_posix, termios
 from imudrv.profiles.schema import SerialLine
 from imudrv.sinks.backlog import Backlog
-from imudrv.sinks.base import Batch, Outlet, Sink, SinkState, Written
+from imudrv.sinks.base import HOUSEKEEPING_NS, Batch, Outlet, Sink, SinkState, Written
 from imudrv.url import device_path, serial_settings, split
 from imudrv.wire.datagram import SIZE
 
@@ -40,7 +40,7 @@ class SerialSink(Sink):
         The path is missing, or a setting is not valid.
     """
 
-    is_patient = True
+    patience_ns = HOUSEKEEPING_NS
 
     def __init__(self, url: str) -> None:
         super().__init__(url)

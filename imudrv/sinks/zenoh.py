@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from imudrv.sinks.backlog import Backlog
-from imudrv.sinks.base import Batch, Outlet, Sink, SinkState, Written
+from imudrv.sinks.base import HOUSEKEEPING_NS, Batch, Outlet, Sink, SinkState, Written
 from imudrv.streams import EVENTS, STATUS, Publication
 from imudrv.url import split
 from imudrv.wire.datagram import SIZE
@@ -33,7 +33,7 @@ class ZenohSink(Sink):
         See `imudrv.streams.Publication`.
     """
 
-    is_patient = True
+    patience_ns = HOUSEKEEPING_NS
 
     def __init__(self, url: str) -> None:
         super().__init__(url)
