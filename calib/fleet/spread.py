@@ -60,7 +60,10 @@ def spread(
 def _client(distributed: Any, workers: int, scheduler: str | None) -> Any:
     if scheduler is None:
         return distributed.Client(
-            n_workers=workers, threads_per_worker=1, dashboard_address=None, silence_logs=logging.ERROR
+            n_workers=workers,
+            threads_per_worker=1,
+            dashboard_address="127.0.0.1:0",  # by default 8787, which another cluster may have
+            silence_logs=logging.ERROR,
         )
     try:
         return distributed.Client(scheduler, timeout=_CONNECT_S)

@@ -308,7 +308,7 @@ def test_sessions_are_identified_again_by_dask_workers_of_which_one_dies_with_th
     serial = reidentify(folders[0])
     assert (serial.fault, serial.shift_mm) == ("", 0.0)
     with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=logging.CRITICAL
+        n_workers=2, threads_per_worker=1, dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL
     ) as cluster:
         spread = reidentify_all(folders, scheduler=cluster.scheduler_address)
         done = [next(spread)]
