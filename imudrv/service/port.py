@@ -18,8 +18,9 @@ from imudrv.units import NS_PER_S
 from imudrv.url import split
 
 BACK_OFF_S: Final = (0.1, 0.2, 0.4, 0.8)
-"""Delays before further attempts to open the port; the last one is repeated."""
+"""Delays before further attempts to open a port that is absent or brings nothing; the last is repeated."""
 
+_IS_BACK: Final = "port is back"
 _SOURCES: Final = {"sim": Source.SIMULATOR, "replay": Source.REPLAY}
 
 
@@ -69,7 +70,9 @@ class PortSupervisor:
         self._users: list[str] = []
         self._errors = LineErrors()  # counted by the driver while the data was good
         self._reconnects = 0
-        self._attempts, self._next_attempt_ns = 0, 0
+        self._attempts, self._next_attempt_ns = 0, 0  # since the last data
+        self._has_data = False  # since it was opened
+        self._fruitless = ""  # why it was lost, if that was before any data came
 
     @property
     def status(self) -> PortStatus:
@@ -116,7 +119,11 @@ class PortSupervisor:
     def _lose(self, lost: PortLostError) -> None:
         self.close()
         self.state = LineState("lost", str(lost))
-        self._events.failure(str(self.state))
+        if str(lost) != self._fruitless:
+            self._events.failure(str(self.state))
+        self._fruitless = "" if self._has_data else str(lost)
+        if self._fruitless:
+            self._wait()
 
     @property
     def descriptor(self) -> int | None:
@@ -125,6 +132,11 @@ class PortSupervisor:
 
     def decoded(self, data: bytes | Records, samples: int) -> None:
         """Take note of data and of the number of samples that they completed."""
+        if not self._has_data:
+            self._has_data, self._attempts = True, 0
+            if self._fruitless:
+                self._fruitless = ""
+                self._events.event(_IS_BACK)
         self._watch.arrived(data, samples, self._clock())
 
     def check_rate(self, expected: int, lost: int, now_ns: int) -> None:
@@ -190,17 +202,17 @@ class PortSupervisor:
         try:
             self._port = open_port(self._url, self._profile)
         except PortLostError as lost:
-            delay_s = BACK_OFF_S[min(self._attempts, len(BACK_OFF_S) - 1)]
-            self._attempts += 1
-            self._next_attempt_ns = self._clock() + round(delay_s * NS_PER_S)
+            self._wait()
+            self._fruitless = ""
             if str(lost) != self.state.trouble:
                 self._events.failure(f"port not available: {lost}")
             self.state = self.state._replace(trouble=str(lost))
             return None
-        self._attempts = 0
+        self._has_data = False
         if self.state.name == "lost":
             self._reconnects += 1
-            self._events.event("port is back")
+            if not self._fruitless:
+                self._events.event(_IS_BACK)
         self.state = LineState("streaming")
         self._watch = LineWatch(self._profile, self._in_real_time, self._clock())
         self._search.clear()
@@ -208,3 +220,9 @@ class PortSupervisor:
         self._users = []
         self._errors = self._port.line_errors()
         return self._port
+
+    def _wait(self) -> None:
+        """Put off the next attempt."""
+        delay_s = BACK_OFF_S[min(self._attempts, len(BACK_OFF_S) - 1)]
+        self._attempts += 1
+        self._next_attempt_ns = self._clock() + round(delay_s * NS_PER_S)
