@@ -7,7 +7,7 @@ A name without a frame in it is on the sensors' own axes; ``dtheta_b`` and ``dv_
 
 from enum import IntEnum, IntFlag
 from struct import Struct
-from typing import Final, NamedTuple, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -157,6 +157,32 @@ class Timebase(NamedTuple):
     slept_ns: int = 0
 
 
+class Reads(NamedTuple):
+    """Reads of a port, one after the other, with the same timebase.
+
+    Parameters
+    ----------
+    data : ndarray of uint8 or of MESSAGE
+        Wire bytes, or CAN messages, of all reads.
+    ends : ndarray of int64, shape (n,)
+        Where each read ends in the data.
+    times : ndarray of int64, shape (n,)
+        Time of each read, host clock, ns.
+    timebase : Timebase
+        Relation of the times to UNIX time.
+    """
+
+    data: NDArray[Any]
+    ends: NDArray[np.int64]
+    times: NDArray[np.int64]
+    timebase: Timebase
+
+    @property
+    def size(self) -> int:
+        """Size of the data, bytes."""
+        return self.data.nbytes
+
+
 class Arrival(NamedTuple):
     """Data of one read of a port.
 
@@ -178,3 +204,14 @@ class Arrival(NamedTuple):
     def size(self) -> int:
         """Size of the data, bytes."""
         return len(self.data) if isinstance(self.data, bytes) else self.data.nbytes
+
+    @property
+    def block(self) -> Reads:
+        """The read as a block of one."""
+        ends, times = np.array([[len(self.data)], [self.t_ns]], np.int64)
+        return Reads(as_array(self.data), ends, times, self.timebase)
+
+
+def as_array(data: bytes | Records) -> NDArray[Any]:
+    """Return wire bytes as an array of uint8, without a copy, and CAN messages as they are."""
+    return np.frombuffer(data, np.uint8) if isinstance(data, bytes) else data

@@ -45,7 +45,7 @@ def record(path: Path, samples: int) -> None:
         increments = np.zeros(1, INCREMENTS)
         increments["counter"], increments["interval_ns"] = n, 1_000_000
         increments["flags"] = 1
-        recorder.arrived(Arrival(1000 + n, b"%044d" % n))
+        recorder.arrived(Arrival(1000 + n, b"%044d" % n).block)
         recorder.publish(Batch(np.zeros(1, PULSES), increments, encode(increments, Source.SIMULATOR)))
     recorder.status(lambda: {"rate_hz": 1000.0})
     recorder.event(5000, "unplugged")

@@ -61,7 +61,7 @@ def record(
         unit="50-0017",
     )
     for arrival in arrivals:
-        recorder.arrived(arrival)
+        recorder.arrived(arrival.block)
     for at in range(len(increments)):  # one by one, so that several messages of the recording hold them
         piece = increments[at : at + 1]
         recorder.publish(Batch(np.zeros(0, PULSES), piece, encode(piece, Source.SIMULATOR)))

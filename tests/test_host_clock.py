@@ -337,7 +337,7 @@ def test_a_recording_keeps_the_timebase_of_each_read(tmp_path: Path) -> None:
     arrivals = [Arrival(BEGIN + k, frames(k, 1), base) for k, base in enumerate(bases)]
     kept = recorder(tmp_path / "run.mcap")
     for arrival in arrivals:
-        kept.arrived(arrival)
+        kept.arrived(arrival.block)
     kept.close()
     assert list(Recording(tmp_path / "run.mcap").arrivals()) == arrivals
     pack(tmp_path / "run.mcap", tmp_path / "packed.mcap")
@@ -364,7 +364,7 @@ def test_live_and_offline_agree_wherever_the_steps_and_the_reads_fall(
     with TemporaryDirectory() as folder:
         kept = recorder(Path(folder) / "run.mcap")
         for arrival in arrivals:
-            kept.arrived(arrival)
+            kept.arrived(arrival.block)
             chain.clock.follow(arrival.timebase)
             live.append(chain.feed(arrival.data, arrival.t_ns).increments)
         live.append(chain.close().increments)

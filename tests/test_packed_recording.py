@@ -71,7 +71,7 @@ def record(path: Path, profile: str = "imu50-rs422") -> None:
     calibration = parse_text(CERTIFICATE.encode(), Calibration, "certificate")
     chain = Chain(profiles.load(profile), coefficients(calibration), "causal", Source.SIMULATOR)
     for arrival in wire(profile):
-        recorder.arrived(arrival)
+        recorder.arrived(arrival.block)
         chain.clock.follow(arrival.timebase)
         recorder.publish(Batch(*chain.feed(arrival.data, arrival.t_ns)))
     recorder.publish(Batch(*chain.close()))

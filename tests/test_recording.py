@@ -2,6 +2,7 @@ import re
 import struct
 import tracemalloc
 from contextlib import suppress
+from io import BytesIO
 from pathlib import Path
 
 import lz4.frame
@@ -11,6 +12,7 @@ import zstandard
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
+from mcap.records import Channel
 from mcap.writer import CompressionType, Writer
 from samples import CERTIFICATE, record
 
@@ -21,6 +23,7 @@ from imudrv.recording import reader
 from imudrv.recording.format import pack_messages, unpack_messages
 from imudrv.recording.pack import pack
 from imudrv.recording.reader import Recording
+from imudrv.recording.writer import ChunkedWriter, McapWriter
 from imudrv.records import MESSAGE, Arrival, Source, Timebase
 from imudrv.sinks.recorder import Recorder
 
@@ -327,7 +330,7 @@ def can_recording(path: Path, reads: int) -> list[Arrival]:
         messages["data"] = rng.integers(0, 256, (len(messages), 64))
         messages["data"][np.arange(64) >= messages["length"][:, None]] = 0
         arrivals.append(Arrival(1000 + n, messages, Timebase(n // 7, 0)))
-        recorder.arrived(arrivals[-1])
+        recorder.arrived(arrivals[-1].block)
     recorder.close()
     return arrivals
 
@@ -392,6 +395,26 @@ def test_whatever_is_damaged_it_is_read_or_reported(
             assert "bad.mcap" in str(error) or isinstance(error, FaultyFileError)  # noqa: PT017
 
 
+@given(st.lists(st.tuples(st.integers(0, 2**62), st.binary(max_size=90)), max_size=20), st.integers(0, 20))
+@pytest.mark.parametrize("kind", [McapWriter, ChunkedWriter])
+def test_messages_encoded_together_are_those_encoded_one_by_one(
+    kind: type[McapWriter], messages: list[tuple[int, bytes]], cut: int
+) -> None:
+    files = [BytesIO(), BytesIO()]
+    one_by_one, together = writers = [kind(file) for file in files]
+    for writer in writers:
+        writer.define(Channel(id=3, topic="x", message_encoding="", metadata={}, schema_id=0))
+    for t_ns, data in messages:
+        one_by_one.message(3, t_ns, data)
+    for part in (messages[:cut], messages[cut:]):
+        times = np.array([t_ns for t_ns, _ in part], np.int64)
+        ends = np.cumsum([len(data) for _, data in part], dtype=np.int64)
+        together.messages(3, times, np.frombuffer(b"".join(data for _, data in part), np.uint8), ends)
+    for writer in writers:
+        writer.finish()
+    assert files[0].getvalue() == files[1].getvalue()
+
+
 @given(st.lists(st.lists(st.tuples(st.integers(0, 64), st.integers(0, 2**29 - 1)), max_size=5), min_size=1))
 def test_can_messages_pack_and_unpack(pieces: list[list[tuple[int, int]]]) -> None:
     arrays = []
@@ -401,9 +424,8 @@ def test_can_messages_pack_and_unpack(pieces: list[list[tuple[int, int]]]) -> No
             row["t_ns"], row["id"], row["length"], row["fd"] = -identifier, identifier, length, length > 8
             row["data"][:length] = np.arange(length) + identifier % 100
         arrays.append(messages)
-    packed = pack_messages(arrays)
-    ends = np.cumsum([len(piece) for piece in packed])
-    messages, message_ends, fault = unpack_messages(np.frombuffer(b"".join(packed), np.uint8), ends)
+    together, ends = np.concatenate(arrays), np.cumsum([len(messages) for messages in arrays])
+    messages, message_ends, fault = unpack_messages(*pack_messages(together, ends))
     assert fault == ""
-    assert np.array_equal(messages, np.concatenate(arrays))
-    assert message_ends.tolist() == np.cumsum([len(messages) for messages in arrays]).tolist()
+    assert np.array_equal(messages, together)
+    assert message_ends.tolist() == ends.tolist()

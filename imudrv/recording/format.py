@@ -18,7 +18,6 @@ The times of all messages are on the scale of the arrivals, which does not step;
 UNIX time.
 """
 
-from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -50,33 +49,60 @@ _HEAD: Final = 14  # bytes of a packed CAN message before its data
 _LONGEST: Final = 64
 
 
-def pack_messages(pieces: Sequence[Records]) -> list[bytes]:
-    """Encode CAN messages for a recording.
+def pack_messages(messages: Records, ends: NDArray[np.int64]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """Encode the CAN messages of several reads for a recording.
 
-    Each piece becomes a byte w, the longest data's length, and then for each message, little-endian: i64
+    A read becomes a byte w, at least the longest data's length, and then for each message, little-endian: i64
     time (ns), u32 identifier, u8 length, u8 CAN FD (1) or not (0), u8[w] data, zeros after the length.
 
     Parameters
     ----------
-    pieces : sequence of ndarray of MESSAGE
-        At least one; encoded together because that is faster.
+    messages : ndarray of MESSAGE
+        Messages of all reads.
+    ends : ndarray of int64, shape (n,)
+        Where each read ends in them.
 
     Returns
     -------
-    list of bytes
-        One a piece.
+    tuple of ndarray of uint8 and ndarray of int64
+        Pieces, one a read, one behind the other; where each ends.
     """
-    messages = np.concatenate(pieces)
     width = int(messages["length"].max(initial=0))
     packed = np.empty(messages.size, _packed_type(width))
     for name in ("t_ns", "id", "length", "fd"):
         packed[name] = messages[name]
     packed["data"] = messages["data"][:, :width]
-    data, size, first = packed.tobytes(), packed.itemsize, bytes([width])
-    ends = np.cumsum([piece.size for piece in pieces]).tolist()
-    return [
-        first + data[(end - piece.size) * size : end * size] for end, piece in zip(ends, pieces, strict=True)
-    ]
+    widths = np.full((len(ends), 1), width, np.uint8)
+    return with_heads(widths, packed.view(np.uint8), packed.itemsize * ends)
+
+
+def with_heads(
+    heads: NDArray[np.uint8], data: NDArray[np.uint8], ends: NDArray[np.int64]
+) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """Put a head before each piece of some data.
+
+    Parameters
+    ----------
+    heads : ndarray of uint8, shape (n, size)
+        Head of each piece.
+    data : ndarray of uint8
+        Pieces, one behind the other.
+    ends : ndarray of int64, shape (n,)
+        Where each piece ends; the last one at the end of the data.
+
+    Returns
+    -------
+    tuple of ndarray of uint8 and ndarray of int64
+        Heads and pieces in turn; where each piece ends in them.
+    """
+    count, size = heads.shape
+    new_ends = ends + size * np.arange(1, count + 1)
+    begins = new_ends - np.diff(ends, prepend=0) - size
+    is_head = np.zeros(data.size + heads.size, np.bool_)
+    is_head[(begins[:, None] + np.arange(size)).ravel()] = True
+    out = np.empty(is_head.size, np.uint8)
+    out[is_head], out[~is_head] = heads.ravel(), data
+    return out, new_ends
 
 
 def unpack_messages(

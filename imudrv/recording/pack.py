@@ -123,7 +123,8 @@ class _Packer:
             increments = self._recording.increments_of(offset, message.data)
             rows = self._encoder.encode(increments, self._temperatures.of(increments["counter"]))
             t_ns = self._clock.times_of(increments)
-            self._writer.messages(_ID, np.clip(t_ns, 0, MAX_TIME_NS).astype(np.uint64), rows)
+            ends = rows.shape[1] * np.arange(1, len(rows) + 1)
+            self._writer.messages(_ID, np.clip(t_ns, 0, MAX_TIME_NS), rows.ravel(), ends)
 
 
 class _ArrivalClock:

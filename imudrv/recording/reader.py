@@ -36,8 +36,8 @@ from imudrv.recording.format import (
     WIRE,
     unpack_messages,
 )
-from imudrv.recording.reads import Gatherer, Reads, Recorded
-from imudrv.records import MESSAGE, Arrival, Records, Timebase
+from imudrv.recording.reads import Gatherer, Recorded
+from imudrv.records import MESSAGE, Arrival, Reads, Records, Timebase
 from imudrv.wire.datagram import DatagramDecoder
 from imudrv.wire.layout import Layout
 

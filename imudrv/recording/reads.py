@@ -4,7 +4,7 @@ A live read brings one sample of some 40 bytes, so a recording is mostly message
 Python for each would take longer than all that is computed from it.
 """
 
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from imudrv.kernels import kernel
 from imudrv.recording.format import CLOCK, MAX_TIME_NS, WIRE
-from imudrv.records import Timebase
 from imudrv.wire.fields import Bytes, word
 
 _RECORD_HEAD: Final = 9  # kind, length
@@ -25,27 +24,6 @@ _STOP, _SKIP, _TAKE = range(3)
 """What to do with a message, by its channel."""
 
 
-class Reads(NamedTuple):
-    """Reads of a port, one after the other, with the same timebase.
-
-    Parameters
-    ----------
-    data : ndarray of uint8 or of MESSAGE
-        Wire bytes, or CAN messages, of all reads.
-    ends : ndarray of int64, shape (n,)
-        Where each read ends in the data.
-    times : ndarray of int64, shape (n,)
-        Time of each read, host clock, ns.
-    timebase : Timebase
-        Relation of the times to UNIX time.
-    """
-
-    data: NDArray[Any]
-    ends: NDArray[np.int64]
-    times: NDArray[np.int64]
-    timebase: Timebase
-
-
 class Recorded(NamedTuple):
     """Reads as they are in the file: of CAN messages, `data` are packed.
 
@@ -54,7 +32,7 @@ class Recorded(NamedTuple):
     encoding : str
         Encoding of the messages.
     data, ends, times
-        See `Reads`.
+        See `imudrv.records.Reads`.
     places : ndarray of int64, shape (n,)
         Where the record of each read begins.
     """

@@ -1,11 +1,12 @@
 """Writers of MCAP files (https://mcap.dev/spec) whose messages come encoded.
 
 Records are those of the library. Its own writer takes 4 us a message, during which the live loop cannot run;
-here it is a tenth of that, and many messages of one size are written at once.
+here many messages are encoded at once.
 """
 
 import struct
 import zlib
+from collections.abc import Sequence
 from importlib.metadata import version
 from typing import IO, Final
 
@@ -31,6 +32,8 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
+
+from imudrv.recording.format import with_heads
 
 CHUNK_BYTES: Final = 1 << 20
 """About the size of a chunk before compression."""
@@ -94,9 +97,37 @@ class McapWriter:
         data : bytes
             As the channel encodes it.
         """
-        record = self._message(channel, t_ns, data)
-        self._file.write(record)
-        self._position += len(record)
+        sequence = self._count(channel, 1, t_ns, t_ns)
+        head = _MESSAGE.pack(Opcode.MESSAGE, _BODY + len(data), channel, sequence & 0xFFFFFFFF, t_ns, t_ns)
+        self._add(head + data, channel, (t_ns,), (0,))
+
+    def messages(
+        self, channel: int, times: NDArray[np.int64], data: NDArray[np.uint8], ends: NDArray[np.int64]
+    ) -> None:
+        """Write messages.
+
+        Parameters
+        ----------
+        channel : int
+            Number of a defined channel.
+        times : ndarray of int64, shape (n,)
+            Time of each.
+        data : ndarray of uint8
+            Data of all, one behind the other.
+        ends : ndarray of int64, shape (n,)
+            Where the data of each ends.
+        """
+        count = len(times)
+        if not count:
+            return
+        sequence = self._count(channel, count, int(times.min()), int(times.max()))
+        heads, sizes = np.zeros(count, _HEAD), np.diff(ends, prepend=0)
+        heads["opcode"], heads["length"], heads["channel"] = Opcode.MESSAGE, _BODY + sizes, channel
+        heads["sequence"] = (sequence + np.arange(count)) & 0xFFFFFFFF
+        heads["log_time"] = heads["publish_time"] = times
+        records, record_ends = with_heads(heads.view(np.uint8).reshape(count, -1), data, ends)
+        begins = record_ends - sizes - heads.itemsize
+        self._add(records.tobytes(), channel, times.tolist(), begins.tolist())
 
     def finish(self) -> None:
         """Write the summary and the end of the file."""
@@ -128,16 +159,19 @@ class McapWriter:
         )
         return [*self._definitions, *self._indexes, statistics]
 
-    def _message(self, channel: int, t_ns: int, data: bytes) -> bytes:
-        """Encode a message and count it."""
+    def _count(self, channel: int, count: int, first_ns: int, last_ns: int) -> int:
+        """Count messages and note their times; return the number of the first one."""
         sequence = self._sequences[channel]
-        self._sequences[channel] = sequence + 1
-        if t_ns > self._last_ns:  # nearly always
-            self._last_ns = t_ns
-        if t_ns < self._first_ns:
-            self._first_ns = t_ns
-        head = _MESSAGE.pack(Opcode.MESSAGE, _BODY + len(data), channel, sequence & 0xFFFFFFFF, t_ns, t_ns)
-        return head + data
+        self._sequences[channel] = sequence + count
+        if last_ns > self._last_ns:  # nearly always
+            self._last_ns = last_ns
+        if first_ns < self._first_ns:
+            self._first_ns = first_ns
+        return sequence
+
+    def _add(self, records: bytes, channel: int, times: Sequence[int], begins: Sequence[int]) -> None:
+        """Write messages, whose records begin there."""
+        self._put(records)
 
     def _put(self, data: bytes) -> int:
         self._file.write(data)
@@ -155,49 +189,16 @@ class ChunkedWriter(McapWriter):
         self._entries: dict[int, list[tuple[int, int]]] = {}  # time and place of each message, by channel
         self._compressor = zstandard.ZstdCompressor()
 
-    def message(self, channel: int, t_ns: int, data: bytes) -> None:
-        """See `McapWriter.message`."""
-        self._add(self._message(channel, t_ns, data), channel, [(t_ns, self._size)])
-
-    def messages(self, channel: int, t_ns: NDArray[np.uint64], data: NDArray[np.uint8]) -> None:
-        """Write messages of one size.
-
-        Parameters
-        ----------
-        channel : int
-            Number of a defined channel.
-        t_ns : ndarray of uint64, shape (n,)
-            Time of each.
-        data : ndarray of uint8, shape (n, size)
-            Data of each.
-        """
-        count, size = data.shape
-        if not count:
-            return
-        rows = np.zeros(count, [("head", _HEAD), ("data", "u1", (size,))])
-        head = rows["head"]
-        sequence = self._sequences[channel]
-        head["opcode"], head["length"], head["channel"] = Opcode.MESSAGE, _BODY + size, channel
-        head["sequence"] = (sequence + np.arange(count)) & 0xFFFFFFFF
-        head["log_time"] = head["publish_time"] = t_ns
-        rows["data"] = data
-        self._sequences[channel] = sequence + count
-        self._first_ns, self._last_ns = (
-            min(self._first_ns, int(t_ns.min())),
-            max(self._last_ns, int(t_ns.max())),
-        )
-        places = range(self._size, self._size + rows.nbytes, rows.itemsize)
-        self._add(rows.tobytes(), channel, list(zip(t_ns.tolist(), places, strict=True)))
-
     def finish(self) -> None:
         """See `McapWriter.finish`."""
         self._finish_chunk()
         super().finish()
 
-    def _add(self, records: bytes, channel: int, entries: list[tuple[int, int]]) -> None:
+    def _add(self, records: bytes, channel: int, times: Sequence[int], begins: Sequence[int]) -> None:
+        places = [self._size + begin for begin in begins]
+        self._entries.setdefault(channel, []).extend(zip(times, places, strict=True))
         self._pieces.append(records)
         self._size += len(records)
-        self._entries.setdefault(channel, []).extend(entries)
         if self._size >= CHUNK_BYTES:
             self._finish_chunk()
 

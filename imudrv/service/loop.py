@@ -328,10 +328,7 @@ class Service:
             for sink, count in zip(self._sinks, outlets, strict=True):
                 sink.written(batch, list(islice(written, count)))
             self._count(batch)
-        if self._recordings.are_on:
-            for arrival, part in served.arrivals(self._clock_watch.timebase):
-                self._recordings.arrived(arrival)
-                self._recordings.publish(part)
+        self._recordings.served(served, self._clock_watch.timebase)
         self._port.decoded(served.data, len(batch.pulses))
 
     def _process(self, arrival: Arrival) -> None:

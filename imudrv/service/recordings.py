@@ -10,7 +10,8 @@ from threading import Thread
 from typing import Final
 
 from imudrv.errors import InputError
-from imudrv.records import Arrival
+from imudrv.records import Arrival, Timebase
+from imudrv.service.serve import Served
 from imudrv.sinks.base import Batch, SinkState
 from imudrv.sinks.history import History
 from imudrv.sinks.recorder import Recorder
@@ -89,10 +90,21 @@ class Recordings:
             return state._replace(state=self._displaced, healthy=False)
         return state
 
+    def served(self, served: Served, timebase: Timebase) -> None:
+        """Record what the kernel has read: as a block, and read by read where a history is kept."""
+        if self._recorder is not None:
+            self._recorder.arrived(served.block(timebase))
+            if served.output.datagrams:
+                self._recorder.publish(Batch(*served.output))
+        if self._history is not None:
+            for arrival, batch in served.arrivals(timebase):
+                self._history.arrived(arrival)
+                self._history.publish(batch)
+
     def arrived(self, arrival: Arrival) -> None:
         """Record an arrival; to be called before it is decoded."""
         if self._recorder is not None:
-            self._recorder.arrived(arrival)
+            self._recorder.arrived(arrival.block)
         if self._history is not None:
             self._history.arrived(arrival)
 

@@ -41,7 +41,7 @@ from imudrv.imu.compensation import MAX_TAPS
 from imudrv.kernels import kernel
 from imudrv.ports.base import OTHER_END_GONE
 from imudrv.ports.socketcan import FRAME_BYTES, MESSAGES_AT_ONCE, receive
-from imudrv.records import MESSAGE, Arrival, Records, Timebase
+from imudrv.records import MESSAGE, Arrival, Reads, Records, Timebase, as_array
 from imudrv.service.clock_watch import STEP_NS, ClockWatch
 from imudrv.service.latency import Latency, count_latency
 from imudrv.service.wake import WakePipe
@@ -150,6 +150,16 @@ class Served(NamedTuple):
     data: bytes | Records
     reads: Records
     written: list[Written]
+
+    def block(self, timebase: Timebase) -> Reads:
+        """Return the reads as a block.
+
+        Parameters
+        ----------
+        timebase : Timebase
+            That of all reads.
+        """
+        return Reads(as_array(self.data), self.reads["stop"], self.reads["t_ns"], timebase)
 
     def arrivals(self, timebase: Timebase) -> Iterator[tuple[Arrival, Batch]]:
         """Return each read, with the samples that it completed.

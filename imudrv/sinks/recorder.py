@@ -11,10 +11,12 @@ from contextlib import suppress
 from hashlib import sha256
 from importlib.metadata import version
 from io import BytesIO
+from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
 from typing import Final, Generic, TypeVar
 
+import numpy as np
 from mcap.records import Attachment, Channel, Metadata, Schema
 from mcap.well_known import MessageEncoding, SchemaEncoding
 
@@ -23,7 +25,7 @@ from imudrv.hostclock import now_ns
 from imudrv.recording import format
 from imudrv.recording.format import pack_messages
 from imudrv.recording.writer import McapWriter
-from imudrv.records import Arrival, Source, Timebase
+from imudrv.records import Reads, Source, Timebase
 from imudrv.sinks.base import Batch, SinkState
 from imudrv.sinks.history import Moment
 from imudrv.wire.datagram import SIZE
@@ -33,7 +35,7 @@ QUEUE_BYTES: Final = 32 << 20
 """Maximum size of each queue: 15 s of single reads at 20 kHz, minutes at 1 kHz."""
 _OVERHEAD: Final = 64
 _PIECE: Final = 256
-"""Most reads, and batches, written at a time."""
+"""Most blocks of reads, and batches, written at a time."""
 _PIECE_BYTES: Final = 1 << 20
 """About as many bytes at a time, so that no message is larger than readers take (4 MiB)."""
 
@@ -85,8 +87,8 @@ class Recorder:
     ) -> None:
         self._path = path
         self._can = layout.can
-        self._wire: _Queue[Arrival] = _Queue(attrgetter("size"))
-        self._datagrams: _Queue[bytes] = _Queue(len)
+        self._wire: _Queue[Reads] = _Queue(lambda reads: len(reads.ends), attrgetter("size"))
+        self._datagrams: _Queue[bytes] = _Queue(lambda datagrams: len(datagrams) // SIZE, len)
         self._notes: deque[tuple[int, int, Callable[[], Mapping[str, object]]]] = deque(maxlen=1000)
         self._calibrations: deque[tuple[int, bytes]] = deque(maxlen=10)
         self._put = 0
@@ -102,16 +104,16 @@ class Recorder:
         """What has happened to the file, such as ``deleted``; empty while its name leads to it."""
         return self._spool.displaced
 
-    def arrived(self, arrival: Arrival) -> None:
-        """Record a read of the port; call it before the data are used.
+    def arrived(self, reads: Reads) -> None:
+        """Record reads of the port; call it before their samples are published.
 
         Parameters
         ----------
-        arrival : Arrival
-            The read; it must not change any more.
+        reads : Reads
+            A block of reads, at most some 100 kB; it must not change any more.
         """
-        if len(arrival.data):
-            self._wire.put(arrival)
+        if reads.size:
+            self._wire.put(reads)
 
     def publish(self, batch: Batch) -> None:
         """Record a batch."""
@@ -128,7 +130,7 @@ class Recorder:
         """
         datagrams = [moment.datagrams for moment in moments if moment.datagrams]
         self._put += sum(map(len, datagrams)) // SIZE
-        self._wire.put(*(moment.arrival for moment in moments))
+        self._wire.put(*(moment.arrival.block for moment in moments))
         self._datagrams.put(*datagrams)
 
     def status(self, document: Callable[[], Mapping[str, object]]) -> None:
@@ -182,7 +184,7 @@ class Recorder:
         words = trouble or "ok"
         if lost:
             words += f"; {lost} reads of the port lost"
-        dropped = self._datagrams.dropped_size // SIZE
+        dropped = self._datagrams.dropped
         queued = self._put - self._spool.sent - dropped
         return SinkState(str(self._path), words, not trouble, self._spool.sent, dropped, queued)
 
@@ -233,16 +235,9 @@ class Recorder:
             while True:
                 t_ns, calibration = self._calibrations.popleft()
                 self._attach(t_ns, format.CALIBRATION, calibration)
-        arrivals = self._wire.take(_PIECE)
-        data = [arrival.data for arrival in arrivals]
-        pieces = pack_messages(data) if self._can and data else data  # type: ignore[arg-type]
-        for arrival, piece in zip(arrivals, pieces, strict=True):
-            if arrival.timebase != self._timebase:
-                self._timebase = arrival.timebase
-                self._writer.message(_CLOCK, arrival.t_ns, json.dumps(self._timebase._asdict()).encode())
-            self._writer.message(_WIRE, arrival.t_ns, piece)  # type: ignore[arg-type]
-        batches = self._datagrams.take(_PIECE)
-        datagrams = b"".join(batches)
+        for _, blocks in groupby(self._wire.take(), attrgetter("timebase")):
+            self._write(_joined(list(blocks)))
+        datagrams = b"".join(self._datagrams.take())
         if datagrams:
             self._writer.message(_INCREMENTS, now_ns(), datagrams)
         with suppress(IndexError):
@@ -251,6 +246,14 @@ class Recorder:
                 self._writer.message(channel, t_ns, json.dumps(document(), default=str).encode())
         more = self._wire.left or self._datagrams.left
         return Piece(self._staging.take(), len(datagrams) // SIZE, more)
+
+    def _write(self, reads: Reads) -> None:
+        if reads.timebase != self._timebase:
+            self._timebase = reads.timebase
+            document = json.dumps(self._timebase._asdict()).encode()
+            self._writer.message(_CLOCK, int(reads.times[0]), document)
+        data, ends = pack_messages(reads.data, reads.ends) if self._can else (reads.data, reads.ends)
+        self._writer.messages(_WIRE, reads.times, data, ends)
 
     def _last_piece(self) -> bytes:
         self._writer.finish()
@@ -273,37 +276,57 @@ _CHANNELS: Final = {
 """Topic, name of the schema and schema of each channel; empty: only documentation describes the bytes."""
 
 
-class _Queue(Generic[T]):
-    """Queue from the loop to the thread, bounded in bytes; each side has its own counts, without a lock."""
+def _joined(blocks: list[Reads]) -> Reads:
+    """Return blocks with the same timebase as one."""
+    begins = np.cumsum([0, *(len(block.data) for block in blocks[:-1])])
+    return Reads(
+        np.concatenate([block.data for block in blocks]),
+        np.concatenate([begin + block.ends for begin, block in zip(begins, blocks, strict=True)]),
+        np.concatenate([block.times for block in blocks]),
+        blocks[0].timebase,
+    )
 
-    def __init__(self, size: Callable[[T], int]) -> None:
-        self.dropped = 0
-        self.dropped_size = 0
-        self._size = size
+
+class _Queue(Generic[T]):
+    """Queue from the loop to the thread, bounded in bytes; each side has its own counts, without a lock.
+
+    Parameters
+    ----------
+    count, size : callable
+        Return the number of reads or samples of an item, and its bytes.
+    """
+
+    def __init__(self, count: Callable[[T], int], size: Callable[[T], int]) -> None:
+        self.dropped = 0  # reads or samples
+        self._count, self._size = count, size
         self._items: deque[T] = deque()
-        self._put = self._taken = 0
+        self._put = self._taken = self._lost = 0  # bytes
         self.left = False  # items, perhaps, by the bounds of the last `take`
 
     def put(self, *items: T) -> None:
         """Append items (in the loop); drop the oldest above the limit."""
         self._items.extend(items)
-        self._put += sum(map(self._size, items)) + _OVERHEAD * len(items)
+        self._put += sum(map(self._room, items))
         with suppress(IndexError):
-            while self._put - self._taken - self.dropped_size - self.dropped * _OVERHEAD > QUEUE_BYTES:
-                self.dropped_size += self._size(self._items.popleft())
-                self.dropped += 1
+            while self._put - self._taken - self._lost > QUEUE_BYTES:
+                item = self._items.popleft()
+                self._lost += self._room(item)
+                self.dropped += self._count(item)
 
-    def take(self, count: int) -> list[T]:
-        """Remove up to `count` items, and about `_PIECE_BYTES`, (in the thread) and return them."""
+    def take(self) -> list[T]:
+        """Remove up to `_PIECE` items, and about `_PIECE_BYTES`, (in the thread) and return them."""
         items: list[T] = []
         size = 0
         with suppress(IndexError):
-            while len(items) < count and size < _PIECE_BYTES:
+            while len(items) < _PIECE and size < _PIECE_BYTES:
                 items.append(self._items.popleft())
-                size += self._size(items[-1])
-        self.left = len(items) == count or size >= _PIECE_BYTES
-        self._taken += size + _OVERHEAD * len(items)
+                size += self._room(items[-1])
+        self.left = len(items) == _PIECE or size >= _PIECE_BYTES
+        self._taken += size
         return items
+
+    def _room(self, item: T) -> int:
+        return self._size(item) + _OVERHEAD * self._count(item)
 
 
 class _Staging(BytesIO):

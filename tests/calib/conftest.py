@@ -125,7 +125,7 @@ def record(
         increments["counter"] = counter[at : at + READ]
         pulses["counter"] = increments["counter"] % (1 << layout.sequence.bits)
         pulses["temperature_degc"] = 35.0
-        recorder.arrived(Arrival(at, encoder.encode(pulses).tobytes()))
+        recorder.arrived(Arrival(at, encoder.encode(pulses).tobytes()).block)
         recorder.publish(Batch(pulses, increments, encode(increments, Source.SIMULATOR)))
     recorder.close()
     return path

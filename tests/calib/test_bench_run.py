@@ -420,7 +420,7 @@ def test_only_the_step_with_a_gap_in_its_recording_is_done_again(
         unit=origin["unit"],
     )
     for arrival in arrivals[len(arrivals) // 3 :]:
-        late.arrived(arrival)
+        late.arrived(arrival.block)
     late.close()
     rewrite(folder, lambda entry: entry.pop("samples", None))
 

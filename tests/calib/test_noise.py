@@ -295,7 +295,7 @@ def recording(path: Path, samples: Records, calibration: str) -> Path:
     for piece in np.split(samples, range(500, len(samples), 500)):
         increments = np.zeros(len(piece), INCREMENTS)
         increments["counter"] = piece["counter"]
-        recorder.arrived(Arrival(int(piece["elapsed_ns"][-1]), encoder.encode(piece).tobytes()))
+        recorder.arrived(Arrival(int(piece["elapsed_ns"][-1]), encoder.encode(piece).tobytes()).block)
         recorder.publish(Batch(piece, increments, encode(increments, Source.SIMULATOR)))
     recorder.close()
     return path

@@ -8,7 +8,7 @@ from imudrv import Source, profiles
 from imudrv.errors import InputError
 from imudrv.ports import PortEndedError, PortLostError, open_port, replay
 from imudrv.recording.format import BYTES, CAN_MESSAGES, PROFILE, WIRE, pack_messages
-from imudrv.records import MESSAGE, Arrival
+from imudrv.records import MESSAGE, Arrival, Records
 from imudrv.wire.candump import format_candump
 
 FRAME = 44  # bytes of imu50-rs422
@@ -21,6 +21,11 @@ def capture(tmp_path):
     path = tmp_path / "unit.raw"
     path.write_bytes(np.random.default_rng(1).integers(0, 256, 1600 * FRAME + 15, np.uint8).tobytes())
     return path
+
+
+def _packed(messages: Records) -> bytes:
+    data, _ = pack_messages(messages, np.array([len(messages)]))
+    return data.tobytes()
 
 
 def _messages(count):
@@ -135,7 +140,7 @@ def test_a_recording_of_messages_is_replayed_with_the_time_of_each(
     speed, can_profile, tmp_path, opened, to_the_end
 ):
     messages = np.split(_messages(600), 200)
-    reads = [(int(part["t_ns"][-1]) + 5, pack_messages([part])[0]) for part in messages]
+    reads = [(int(part["t_ns"][-1]) + 5, _packed(part)) for part in messages]
     path = _recording(tmp_path / "unit.mcap", CAN_MESSAGES, reads)
     found = to_the_end(opened(f"replay://{path}?speed={speed}", can_profile))
     assert [arrival.t_ns for arrival in found] == [t_ns for t_ns, _ in reads]
@@ -146,7 +151,7 @@ def test_a_recording_of_another_kind_of_unit_is_a_mistake_of_the_user(rs422, can
     serial = _recording(tmp_path / "serial.mcap", BYTES, [(1, b"x")])
     with pytest.raises(InputError, match="for imu50-can, got a recording of bytes of a serial line"):
         open_port(f"replay://{serial}", can_profile)
-    bus = _recording(tmp_path / "can.mcap", CAN_MESSAGES, [(1, pack_messages([_messages(1)])[0])])
+    bus = _recording(tmp_path / "can.mcap", CAN_MESSAGES, [(1, _packed(_messages(1)))])
     with pytest.raises(InputError, match="for imu50-rs422, got a recording of CAN messages"):
         open_port(f"replay://{bus}", rs422)
 

@@ -10,17 +10,22 @@ import time
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from mcap.reader import NonSeekingReader, make_reader
+from numpy.typing import NDArray
 from realtime import DEADLINE_S, until
 
 from imudrv import profiles
 from imudrv.errors import InputError
 from imudrv.files import spool
 from imudrv.recording.reader import Recording
-from imudrv.records import MESSAGE, Arrival, Source
+from imudrv.records import MESSAGE, Arrival, Reads, Source, Timebase, as_array
 from imudrv.sinks import recorder as recorder_module
 from imudrv.sinks.recorder import Recorder
 from imudrv.wire.datagram import SIZE
@@ -48,9 +53,9 @@ def test_the_library_itself_reads_all_that_was_recorded(batch, tmp_path: Path) -
     path = tmp_path / "run.mcap"
     recorder = open_recorder(path)
     for n in range(20):
-        recorder.arrived(Arrival(1000 + n, bytes([n]) * 44))
+        recorder.arrived(Arrival(1000 + n, bytes([n]) * 44).block)
         recorder.publish(batch(n, 1))
-    recorder.arrived(Arrival(2000, b""))
+    recorder.arrived(Arrival(2000, b"").block)
     recorder.status(lambda: {"rate_hz": 1000.0, "path": Path("x")})
     recorder.event(3000, "unplugged")
     recorder.calibration(4000, b"two: 2\n")
@@ -106,7 +111,7 @@ def test_can_messages_are_recorded_exactly(batch, tmp_path: Path) -> None:
             row["length"], row["fd"] = rng.choice([0, 1, 8, 48, 64]), rng.integers(0, 2)
             row["data"][: row["length"]] = rng.integers(0, 256, row["length"])
         sent.append(messages)
-        recorder.arrived(Arrival(10**18 + n, messages))
+        recorder.arrived(Arrival(10**18 + n, messages).block)
     recorder.close()
     recording = Recording(path)
     got = list(recording.arrivals())
@@ -117,12 +122,58 @@ def test_can_messages_are_recorded_exactly(batch, tmp_path: Path) -> None:
     assert recording.profile.name == "imu50-canfd"
 
 
+@given(
+    st.lists(
+        st.tuples(st.integers(1, 90), st.sampled_from([Timebase(), Timebase(7)]), st.booleans()), max_size=20
+    ),
+    st.sampled_from(["imu50-rs422", "imu50-canfd"]),
+)
+@settings(deadline=None, max_examples=25)
+def test_reads_are_recorded_alike_in_any_blocks(
+    drawn: list[tuple[int, Timebase, bool]], profile: str
+) -> None:
+    """Drawn are the length of a read, its timebase, and whether a block begins with it."""
+    numbers = np.arange(sum(size for size, _, _ in drawn))
+    whole: NDArray[Any] = numbers.astype(np.uint8)
+    if profile == "imu50-canfd":
+        whole = np.zeros(len(numbers), MESSAGE)
+        whole["t_ns"], whole["length"], whole["data"][:, 0] = numbers, numbers % 64 + 1, numbers
+    arrivals: list[Arrival] = []
+    blocks: list[list[Arrival]] = []
+    begin = 0
+    for k, (size, timebase, is_first) in enumerate(drawn):
+        data = whole[begin : begin + size]
+        arrivals.append(Arrival(1000 + k, data if data.dtype == MESSAGE else data.tobytes(), timebase))
+        begin += size
+        if is_first or not blocks or blocks[-1][0].timebase != timebase:
+            blocks.append([])
+        blocks[-1].append(arrivals[-1])
+    with TemporaryDirectory() as folder:
+        one_by_one = open_recorder(Path(folder) / "reads.mcap", profile)
+        for arrival in arrivals:
+            one_by_one.arrived(arrival.block)
+        one_by_one.close()
+        in_blocks = open_recorder(Path(folder) / "blocks.mcap", profile)
+        in_blocks.arrived(Arrival(1, b"", Timebase(9)).block)
+        for block in blocks:
+            data = np.concatenate([as_array(arrival.data) for arrival in block])
+            ends = np.cumsum([len(arrival.data) for arrival in block])
+            times = np.array([arrival.t_ns for arrival in block])
+            in_blocks.arrived(Reads(data, ends, times, block[0].timebase))
+        in_blocks.close()
+        for path in Path(folder).iterdir():
+            got = Recording(path).arrivals()
+            assert [(a.t_ns, bytes(a.data), a.timebase) for a in got] == [
+                (a.t_ns, bytes(a.data), a.timebase) for a in arrivals
+            ]
+
+
 def test_wire_bytes_are_recorded_before_their_increments(batch, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     recorder = open_recorder(path)
     for n in range(5):
         recorder.publish(batch(n, 1))
-        recorder.arrived(Arrival(n, b"x"))
+        recorder.arrived(Arrival(n, b"x").block)
     recorder.close()
     with path.open("rb") as file:
         topics = [c.topic for _, c, _ in make_reader(file).iter_messages(log_time_order=False)]
@@ -159,13 +210,13 @@ def test_a_full_disk_is_reported_and_leaves_the_file_intact(
     put = 0
     while recorder.state.healthy:
         for _ in range(20):  # far fewer than the queue holds
-            recorder.arrived(Arrival(put, b"%044d" % put))
+            recorder.arrived(Arrival(put, b"%044d" % put).block)
             recorder.publish(batch(put, 1))
             put += 1
         wait_for(lambda: recorder.state.queued == 0 or not recorder.state.healthy)
     assert recorder.state.state == "disk full"
     while "reads of the port lost" not in recorder.state.state or recorder.state.dropped < 100:
-        recorder.arrived(Arrival(put, b"%044d" % put))
+        recorder.arrived(Arrival(put, b"%044d" % put).block)
         recorder.publish(batch(put, 1))
         put += 1
     assert recorder.state.state.startswith("disk full; ")
@@ -219,7 +270,7 @@ def test_recording_continues_when_a_full_disk_has_room_again(batch, wait_for, sm
 
     def feed() -> None:
         nonlocal put
-        recorder.arrived(Arrival(put, b"%044d" % put))
+        recorder.arrived(Arrival(put, b"%044d" % put).block)
         recorder.publish(batch(put, 1))
         put += 1
 
@@ -257,7 +308,7 @@ from imudrv.ports.base import Arrival
 recorder = open_recorder(Path({str(path)!r}))
 n = 0
 while recorder.state.state != "disk full":
-    recorder.arrived(Arrival(n, b"%044d" % n))
+    recorder.arrived(Arrival(n, b"%044d" % n).block)
     n += 1
     time.sleep(0.0005)
 recorder.close()
@@ -280,7 +331,7 @@ recorder = open_recorder(Path({path!r}))
 n = 0
 def read():
     global n
-    recorder.arrived(Arrival(n, b"%044d" % n))
+    recorder.arrived(Arrival(n, b"%044d" % n).block)
     n += 1
 for line in sys.stdin:
     for _ in range(int(line)):
@@ -319,13 +370,17 @@ def numbers(path: Path) -> list[int]:
     return [int(arrival.data) for arrival in Recording(path).arrivals()]
 
 
-def test_every_queue_is_bounded(batch, tmp_path: Path, monkeypatch) -> None:
+@pytest.mark.parametrize("size", [1, 10])
+def test_every_queue_is_bounded_and_counts_what_it_drops(
+    size: int, batch, tmp_path: Path, monkeypatch
+) -> None:
     monkeypatch.setattr(recorder_module, "QUEUE_BYTES", 100 * (SIZE + 64))
     monkeypatch.setattr("imudrv.files.spool.PERIOD_S", 3600)
     recorder = open_recorder(tmp_path / "run.mcap")
-    for n in range(1000):
-        recorder.arrived(Arrival(n, b"x" * SIZE))
-        recorder.publish(batch(n, 1))
+    data, ends = np.zeros(size * SIZE, np.uint8), SIZE * np.arange(1, size + 1)
+    for n in range(0, 1000, size):
+        recorder.arrived(Reads(data, ends, n + np.arange(size), Timebase()))
+        recorder.publish(batch(n, size))
     assert recorder.state[3:] == (0, 900, 100)
     assert recorder.state.state == "ok; 900 reads of the port lost"
     recorder.close()

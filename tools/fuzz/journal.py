@@ -96,7 +96,7 @@ def _record(path: Path) -> None:
     )
     pulses, increments = np.zeros(100, PULSES), np.zeros(100, INCREMENTS)
     pulses["counter"] = increments["counter"] = np.arange(100)
-    recorder.arrived(Arrival(1, StreamEncoder(layout).encode(pulses).tobytes()))
+    recorder.arrived(Arrival(1, StreamEncoder(layout).encode(pulses).tobytes()).block)
     recorder.publish(Batch(pulses, increments, encode(increments, Source.SIMULATOR)))
     recorder.close()
 

@@ -89,7 +89,7 @@ def make_recording(rng: Generator) -> tuple[Setup, bytes]:
         topic = int(rng.integers(len(TOPICS) + (rng.integers(20) == 0)))
         if topic == 0:
             sent = transmit(rng, layout, small_number(rng, 60))
-            data = pack_messages([sent])[0] if layout.can else sent
+            data = pack_messages(sent, np.array([len(sent)]))[0].tobytes() if layout.can else sent
         elif topic == 2:
             made = np.frombuffer(rng.bytes(small_number(rng) * INCREMENT.itemsize), INCREMENT)
             data = encode(made, Source.REPLAY)
