@@ -8,6 +8,9 @@ changes the memory needed.
              rest, or more than half a block missing; includes quiet intervals under a second
     rest     the intervals between motions; one of more than half an hour counts as several of equal length
 
+A turn is slow at both ends and sinks in a noise floor F there: a rate that grows as t^2 passes 4 F at twice
+the time at which it passes F, so that the turn began as long before F as it took from F to 4 F.
+
 The angle of a motion is measured about the vertical in body axes (specific force of the rest before,
 propagated by the gyros); its axis is that of the sum of its angles. `calib.detection.acceptance` decides
 whether a motion is a rotation of the procedure.
@@ -42,6 +45,10 @@ from imudrv.units import DEG, NS, UG
 
 QUIET_S: Final = 1.0
 """Minimum length of a rest; shorter quiet intervals are merged into the motion, s."""
+
+
+LONGEST_ONSET_S: Final = 1.0
+"""Longest time that a motion is widened by at each end, s."""
 
 
 SIGMAS: Final = 8.0
@@ -324,10 +331,12 @@ def _still(moving: NDArray[np.bool_]) -> list[tuple[int, int]]:
 def _moving_mask(blocks: _Blocks) -> NDArray[np.bool_]:
     """Return which blocks are in motion."""
     rate_noise, force_noise = _noise_floors(blocks)
-    masks, index = [], 0
+    floor = 2.0 * EARTH_RATE + SIGMAS * rate_noise
+    masks, fast, index = [], [], 0
     for rows in blocks.pieces(0, len(blocks.store)):
-        rate = rows["dtheta_b"] / (rows["interval_ns"][:, None] * NS)
-        mask = np.linalg.norm(rate, axis=1) > 2.0 * EARTH_RATE + SIGMAS * rate_noise
+        rate = np.linalg.norm(rows["dtheta_b"] / (rows["interval_ns"][:, None] * NS), axis=1)
+        fast.append(rate > 4.0 * floor)
+        mask = rate > floor
         mask |= rows["interval_ns"] * NS < 0.5 * blocks.size * blocks.interval_s
         mask |= np.diff(rows["index"], prepend=index) > 1  # whole blocks are missing
         masks.append(mask)
@@ -338,7 +347,7 @@ def _moving_mask(blocks: _Blocks) -> NDArray[np.bool_]:
         force = rows["dv_b"] / (rows["interval_ns"][:, None] * NS)
         change = force - np.median(force, axis=0)
         moving[begin:stop] |= np.linalg.norm(change, axis=1) > LEAST_FORCE + SIGMAS * force_noise
-    return _merged(moving, blocks)
+    return _with_slow_ends(_merged(moving, blocks), np.concatenate(fast), blocks.per_second)
 
 
 def _noise_floors(blocks: _Blocks) -> tuple[float, float]:
@@ -370,6 +379,18 @@ def _merged(moving: NDArray[np.bool_], blocks: _Blocks) -> NDArray[np.bool_]:
         if inside and (blocks.counter(stop) - blocks.counter(begin)) * blocks.interval_s < QUIET_S:
             wide[begin:stop] = True
     return wide
+
+
+def _with_slow_ends(merged: NDArray[np.bool_], fast: NDArray[np.bool_], per_second: int) -> NDArray[np.bool_]:
+    """Widen each motion by what sinks in the noise floor at its ends; `fast` is four times above it."""
+    whole, longest = merged.copy(), round(LONGEST_ONSET_S * per_second)
+    for begin, stop in _runs(merged, True):
+        at = begin + np.flatnonzero(fast[begin:stop])
+        if len(at):
+            # the motion has been widened by one block on both sides
+            early, late = (min(int(n) - 2, longest) for n in (at[0] - begin, stop - 1 - at[-1]))
+            whole[max(0, begin - max(0, early)) : stop + max(0, late)] = True
+    return whole
 
 
 def _rest(blocks: _Blocks, begin: int, stop: int) -> Rest:

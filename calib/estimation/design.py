@@ -204,14 +204,15 @@ def _skew_column(run: Run, C: Array, dt: Array) -> Array:
 
         integral of C_nb df_b = f_n(t) - f_n(0) - integral of dC_nb f_b
 
-    with the specific force as navigated. At rest the first two cancel. Next to a turn their difference is the
-    acceleration between the means over a row before and after: a vibration of the case, such as its reaction
-    to the dither, is neither in the readings, which are means, too, nor may it determine the skew.
+    with the specific force as navigated. At rest the first two cancel, up to the very turn: velocities change
+    there by pulses and noise, which may not determine the skew. In a turn their difference is the
+    acceleration between the means over a row before and after, which a vibration of the case is not in.
     """
     C_nb = Attitude.from_quat(np.roll(run.rows["q_nb"], -1, axis=1)).as_matrix()
     f_n = _acceleration(run, dt, np.zeros((len(dt), 3))) + np.array([0.0, 0.0, run.gravity])
     f_b = np.einsum("nji,nj->ni", C, f_n)
-    moving = ~run.at_rest
+    counter = run.rows["counter"]
+    moving = np.any([(turn.start <= counter) & (counter < turn.stop) for turn in run.turns], axis=0)
     column = -np.cumsum(np.einsum("nij,nj->ni", np.diff(C_nb, axis=0, prepend=C_nb[:1]), f_b), axis=0)
     of_means = np.diff(run.v_n, axis=0, append=run.v_n[-1:]) / dt[:, None]
     column[moving] += of_means[moving]

@@ -1,7 +1,8 @@
 """Cramer-Rao bound of the lever arms: what the random walks leave, were the velocities at rest known exactly.
 
 It has the noise, the priors and the turns of an estimate, and every velocity of the rests up to the turns
-instead of the readings of pulses.
+instead of the readings of pulses. What pulses hide it does not know: an estimate is 1 % above it with pulses
+of 0.5 mm/s, and 12 to 17 % with those of 5 mm/s, where reading every edge of a pulse would gain 0.03 %.
 """
 
 from collections.abc import Sequence

@@ -279,10 +279,14 @@ def test_a_shaking_that_the_filter_passes_is_refused(simulated: tuple[list[Run],
     assert estimate_plain(runs).refusals == ()  # its sigma is forty times as large
 
 
-def test_the_stated_covariance_is_that_of_the_best_estimate(simulated: tuple[list[Run], Array]) -> None:
-    runs, _ = simulated
-    known = Priors(skew=0.0)  # a velocity without error next to a turn would show the skew, too
-    assert 1.0 <= sigma_over_bound(estimate_joint(runs, known), runs, known) < 1.03  # the requirement
+@pytest.mark.parametrize("priors", [Priors(skew=0.0), Priors()], ids=["skew known", "skew unknown"])
+@pytest.mark.parametrize("rotations", [3, 6])
+def test_the_stated_covariance_is_that_of_the_best_estimate(
+    simulated: tuple[list[Run], Array], rotations: int, priors: Priors
+) -> None:
+    # 1.08 for three and an unknown skew, when noise next to a turn seemed to show the skew to the bound
+    runs = simulated[0][:rotations]
+    assert 1.0 <= sigma_over_bound(estimate_joint(runs, priors), runs, priors) < 1.03  # the requirement
 
 
 def test_the_scatter_depends_on_the_walk_as_far_as_its_band_allows_for(

@@ -13,6 +13,7 @@ from calib.detection.segments import Rotation, Segments, find_segments
 from calib.messages import english
 from imudrv.errors import InputError
 from imudrv.records import Flag, Records
+from imudrv.units import ARCSEC
 
 Bench = Callable[..., Records]
 Step = Callable[..., Any]
@@ -250,6 +251,20 @@ def test_a_leap_of_the_counter_costs_no_memory(bench: Bench, step: Step) -> None
 def test_the_noise_floor_is_the_datas_own(bench: Bench, step: Step, times: float) -> None:
     data = bench(step(40.0), step(2.5, 180.0), step(8.0), arw=times * 6e-7, vrw=times * 5e-5)
     assert rejection_reasons(only(find_segments([data])), LIMITS) == ()
+
+
+@pytest.mark.parametrize("duration_s", [2.5, 5.0])
+def test_a_turn_is_found_whole_though_its_slow_ends_sink_in_the_noise(
+    bench: Bench, step: Step, duration_s: float
+) -> None:
+    # dither that the sample rate aliases: the rests had 7 deg/s in them, and arms of 30 mm were off by 5 mm
+    data = bench(step(10.0), step(duration_s, 180.0), step(10.0))
+    dither = 75.0 * ARCSEC * np.sin(2.0 * np.pi * 8.0 * 2e-3 * np.arange(len(data) + 1))
+    data["dtheta_b"] += np.diff(dither)[:, None]
+    found = only(find_segments([data]))
+    # no rest contains a block of the turn, and what they lose is a small part of theirs
+    assert 9.5 < found.start_s < 10.01
+    assert 9.99 < found.stop_s - duration_s < 10.5
 
 
 def test_noise_is_found_in_the_rests(bench: Bench, step: Step) -> None:
