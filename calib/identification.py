@@ -31,6 +31,7 @@ from imudrv.capture import Capture
 from imudrv.errors import InputError
 from imudrv.files import settings_file
 from imudrv.files.atomic import sha256, unchanged
+from imudrv.imu.sequence import SampleCounts
 from imudrv.profiles.schema import Profile
 from imudrv.recording.reader import Recording
 from imudrv.records import Records
@@ -139,8 +140,8 @@ class CaptureSummary:
         SHA-256 of the file.
     profile : str
         Name of the wire format.
-    counts : str
-        Sample counts and losses, in one line.
+    counts : SampleCounts
+        Samples and losses.
     temperatures : tuple of Temperature
         Range of each channel that the unit reported.
     rotations : CaptureRuns
@@ -153,7 +154,7 @@ class CaptureSummary:
     name: str
     sha256: str
     profile: str
-    counts: str
+    counts: SampleCounts
     temperatures: tuple[Temperature, ...]
     rotations: CaptureRuns
     channel: str | None = None
@@ -407,7 +408,7 @@ def _read(
     except InputError as error:
         raise error if str(path) in str(error) else InputError(f"{path}: {error}") from None
     temperatures = temperature_ranges(layout.temperature_names, low, high)
-    counts = str(capture.tracker.counts)
+    counts = capture.tracker.counts
     return CaptureSummary(label, path.name, digest, layout.name, counts, temperatures, rotations, channel)
 
 

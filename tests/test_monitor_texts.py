@@ -1,4 +1,4 @@
-"""The monitor in each language: the same keys and values, and every label of the page."""
+"""The monitor in each language: the same keys and values, every name, every label of the page."""
 
 import re
 from importlib import resources
@@ -6,7 +6,8 @@ from string import Formatter
 
 import pytest
 
-from imudrv.messages import LANGUAGES, catalogue
+from imudrv.messages import LANGUAGES, catalogue, named
+from imudrv.records import Reason
 from imudrv.service.latency import Latency, count_latency
 from imudrv.service.web_monitor import octaves
 
@@ -29,6 +30,15 @@ def test_every_label_of_the_monitor_page_is_in_the_catalogues_and_no_other() -> 
     names = set(re.findall(r'data-label="(\w+)"', html)) | set(re.findall(r'label\("(\w+)"\)', script))
     labels = {key.removeprefix("page_") for key in catalogue("en") if key.startswith("page_")}
     assert labels == names | {"ok", "warn", "fail"}  # the health
+
+
+@pytest.mark.parametrize("language", LANGUAGES)
+def test_every_reason_of_rejection_has_a_text_in_every_language(language: str) -> None:
+    texts = catalogue(language)
+    names = {key.removeprefix("rejected_") for key in texts if key.startswith("rejected_")}
+    assert names == {reason.name.lower() for reason in Reason}
+    assert named(texts, "rejected", "no_sync") == {"en": "no sync", "zh_CN": "无同步字"}[language]
+    assert named(texts, "output", "no route to host") == "no route to host"
 
 
 def test_the_histogram_of_latencies_has_every_sample_once_in_bins_of_a_factor_of_two() -> None:

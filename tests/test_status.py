@@ -60,6 +60,9 @@ def test_an_event_is_published_at_once_and_the_rate_is_still_over_a_whole_second
         os.close(master)
         service.step()
         assert "port lost" in service.status.events[-1]
+        lost, *_ = service.status.reasons("en")
+        assert lost.startswith("port lost: ")
+        assert service.status.reasons("zh_CN")[0] == lost.replace("port lost: ", "端口已断开：")
         assert service.status.rate_hz == 0.0
         clock.t_ns += HOUSEKEEPING_NS
         service.step()

@@ -265,7 +265,7 @@ def _summarise(
         attempt.recording.name,
         digest,
         layout.name,
-        str(decoded.counts),
+        decoded.counts,
         temperature_ranges(layout.temperature_names, np.fmin.reduce(degc), np.fmax.reduce(degc)),
         _navigate(procedure, attempt, decoded, calibration, site),
     )

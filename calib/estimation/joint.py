@@ -37,6 +37,7 @@ from calib.estimation.result import (
     ParameterEstimate,
 )
 from calib.estimation.runs import Run
+from calib.messages import message
 from imudrv.arrays import Array
 from imudrv.errors import InputError
 from imudrv.units import STANDARD_GRAVITY, UG
@@ -135,7 +136,7 @@ def estimate_joint(
             run_result(run, R, _fit(designs[k], x[system.columns_of(k)])) for k, run in enumerate(runs)
         ),
         notes=tuple(
-            f"{n.name} not observable in these runs: sigma {n.sigma * STANDARD_GRAVITY**2 / UG:.3g} ug/g^2"
+            message("not_observable", name=n.name, sigma_ug_per_g2=n.sigma * STANDARD_GRAVITY**2 / UG)
             for n in found
             if n.name.startswith("quadratic") and not n.observable
         ),

@@ -5,19 +5,20 @@ from collections.abc import Sequence
 import numpy as np
 
 from calib.estimation.runs import Run
+from calib.messages import Message, message
 from imudrv.arrays import Array
 from imudrv.errors import InputError
 from imudrv.units import MM
 
 
-def rank_reason(rank: int, sigma: Array, limit: float) -> str:
+def rank_reason(rank: int, sigma: Array, limit: float) -> Message:
     """Return the reason for the rank, in words."""
-    observable = (
-        f"rank {rank}: the observable directions have a sigma of at most {sigma[rank - 1] / MM:.3g} mm"
-    )
+    observable = message("rank_observable", rank=rank, worst_mm=float(sigma[rank - 1]) / MM)
     if rank == 9:
         return observable
-    return f"{observable}, the next one {sigma[rank] / MM:.3g} mm; the limit is {limit / MM:g} mm"
+    return message(
+        "rank_limited", observable=observable, next_mm=float(sigma[rank]) / MM, limit_mm=limit / MM
+    )
 
 
 def require_axes(runs: Sequence[Run]) -> None:

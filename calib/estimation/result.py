@@ -10,6 +10,7 @@ from scipy.special import chdtrc, chdtri, fdtrc, fdtri
 from calib.estimation.dither_line import DitherLine
 from calib.estimation.noise import SensorNoise
 from calib.lever_arms.gauge import LeverArms
+from calib.messages import Message, english, message
 from imudrv.arrays import Array
 from imudrv.imu.rate_filter import RateFilterName
 from imudrv.units import ARCSEC
@@ -207,7 +208,7 @@ class LeverArmEstimate:
         1-sigma of each principal direction of R, m, best first.
     singular_values : ndarray, shape (9,)
         Singular values of the stacked horizontal H after the rotations, m/s per m.
-    reason : str
+    reason : Message
         Explanation of the rank.
     scatter : ChiSquare or None
         Whether the velocity within each rest is as the noise makes it; None: method `plain` does not test it.
@@ -225,7 +226,7 @@ class LeverArmEstimate:
         The estimate without each turn.
     runs : tuple of RunResult
         Each run.
-    notes : tuple of str
+    notes : tuple of Message
         Remarks for the reader.
     """
 
@@ -236,7 +237,7 @@ class LeverArmEstimate:
     rank: int
     direction_sigma: Array
     singular_values: Array
-    reason: str
+    reason: Message
     scatter: ChiSquare | None
     redundancy: ChiSquare
     noise: SensorNoise
@@ -245,7 +246,7 @@ class LeverArmEstimate:
     correlation: Array
     leave_one_out: tuple[LeaveOneOut, ...]
     runs: tuple[RunResult, ...]
-    notes: tuple[str, ...]
+    notes: tuple[Message, ...]
 
     @property
     def arms(self) -> LeverArms:
@@ -288,37 +289,51 @@ class LeverArmEstimate:
 
     @property
     def refusals(self) -> tuple[str, ...]:
+        """`faults` in English."""
+        return tuple(map(english, self.faults))
+
+    @property
+    def faults(self) -> tuple[Message, ...]:
         """Reasons against a certificate from this result, with what to do; empty: none."""
-        refusals = []
+        faults = []
         scatter, redundancy = self.scatter, self.redundancy
         if scatter is not None and scatter.value > SCATTER_LIMIT * scatter.degrees_of_freedom:
-            refusals.append(
-                "the velocities within the rests contradict the noise of the alignments: expected chi-square "
-                f"of about {scatter.degrees_of_freedom}, got {scatter.value:.0f}; the report's figures show "
-                "where: look for what moved the bench, and record again"
-            )
+            faults.append(message("fault_scatter", n=scatter.degrees_of_freedom, value=scatter.value))
         if redundancy.p_value < CONTRADICTION_P:
-            refusals.append(
-                "the turns contradict each other: expected chi-square of about "
-                f"{redundancy.degrees_of_freedom}, got {redundancy.value:.1f}, which chance gives once in "
-                f"{1.0 / max(redundancy.p_value, 1e-99):.2g}; the comparison without each turn shows which "
-                "one deviates: leave it out, or look for what moved"
+            faults.append(
+                message(
+                    "fault_redundancy",
+                    n=redundancy.degrees_of_freedom,
+                    value=redundancy.value,
+                    once_in=1.0 / max(redundancy.p_value, 1e-99),
+                )
             )
         if self.dither_error > DITHER_LIMIT:
-            refusals.append(_dither_refusal(self.dither_error, self.runs))
-        return tuple(refusals)
+            faults.append(_dither_fault(self.dither_error, self.runs))
+        return tuple(faults)
 
 
-def _dither_refusal(error: float, runs: Sequence[RunResult]) -> str:
-    worst = max(runs, key=lambda run: run.H_rest)
-    lines = ", ".join(
-        f"{line.amplitude_rad / ARCSEC:.3g} arcsec at {line.frequency_hz:.0f} Hz about {line.axis}"
-        for line in worst.lines
+def dither_lines(run: RunResult) -> tuple[Message, ...]:
+    """Return the dither lines of a run as messages."""
+    return tuple(
+        message(
+            "dither_of_gyro",
+            amplitude_arcsec=line.amplitude_rad / ARCSEC,
+            frequency_hz=line.frequency_hz,
+            axis=line.axis,
+        )
+        for line in run.lines
     )
-    return (
-        f"the gyro increments carry dither or vibration ({lines or 'no single line'}) that the rate filter "
-        f"{worst.rate_filter} passes: H is {worst.H_rest:.2g} m/s per m at the end of the rest before the "
-        f"turn ({worst.label}), which costs {error:.2g} sigma, expected at most {DITHER_LIMIT:g}; let the "
-        "unit remove its dither from the increments, use the rate filter dither, or stop what shakes the "
-        "bench, and record again"
+
+
+def _dither_fault(error: float, runs: Sequence[RunResult]) -> Message:
+    worst = max(runs, key=lambda run: run.H_rest)
+    return message(
+        "fault_dither",
+        lines=dither_lines(worst) or message("no_single_line"),
+        filter=worst.rate_filter,
+        H_rest=worst.H_rest,
+        run=worst.label,
+        error_sigma=error,
+        limit_sigma=DITHER_LIMIT,
     )

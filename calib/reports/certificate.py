@@ -7,9 +7,19 @@ from typing import Final
 
 from calib.identification import IdentificationResult
 from calib.lever_arms.gauge import LeverArms
-from calib.messages import LANGUAGES, Message, message, text
+from calib.messages import Message, message
 from calib.reports.budget import budget
-from calib.reports.document import Block, Document, KeyValues, Paragraph, Say, Section, Table, drawn, sanitise
+from calib.reports.document import (
+    Block,
+    Document,
+    KeyValues,
+    Paragraph,
+    Say,
+    Section,
+    Table,
+    sanitise,
+    translations,
+)
 from calib.reports.identification import document as report
 from calib.reports.identification import result_blocks
 from imudrv.bench import Bench
@@ -57,7 +67,7 @@ class Particulars:
 def documents(
     identification: IdentificationResult, arms: Sequence[LeverArms], particulars: Particulars
 ) -> dict[str, Document]:
-    """Return the certificate in each language, with the report of the identification, in English, as annex.
+    """Return the certificate in each language, with the report of the identification as annex.
 
     Parameters
     ----------
@@ -73,21 +83,17 @@ def documents(
     dict of str to Document
         By the names of `LANGUAGES`.
     """
-    annex = drawn(report(identification, arms)).sections[1:]
-    return {
-        language: _document(identification, arms, particulars, annex, partial(text, language=language))
-        for language in LANGUAGES
-    }
+    return translations(partial(_document, identification, arms, particulars))
 
 
 def _document(
     identification: IdentificationResult,
     arms: Sequence[LeverArms],
     particulars: Particulars,
-    annex: Sequence[Section],
     say: Say,
 ) -> Document:
     prior = identification.prior_calibration.calibration
+    annex = report(identification, arms, say).sections[1:]
     result = (*result_blocks(identification, arms, say), Paragraph(say(message("coverage"))))
     return Document(
         say(message("certificate_title", number=particulars.number)),
@@ -219,4 +225,4 @@ def _signatures(given: Particulars, say: Say) -> Iterator[Block]:
     yield Paragraph(say(message("signed_operator", name=operator, line=_LINE)))
     yield Paragraph(say(message("signed_authorised", name=authorised, line=_LINE)))
     yield Paragraph(say(message("only_in_full")))
-    yield Paragraph(say(message("annex_language")))
+    yield Paragraph(say(message("words_in_figures")))

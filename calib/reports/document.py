@@ -1,11 +1,11 @@
 """Content of a document, without its form: `text` and `html` render it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from typing import Final, TypeAlias
 
-from calib.messages import Message, message
+from calib.messages import LANGUAGES, Message, message, text
 
 
 @dataclass(frozen=True)
@@ -62,13 +62,20 @@ class Document:
     sections: tuple[Section, ...]
 
 
-def drawn(document: Document) -> Document:
-    """Return a document with its figures drawn, for more than one use."""
+def translations(made: Callable[[Say], Document]) -> dict[str, Document]:
+    """Return a document in each of `LANGUAGES`; its figures are drawn once for all."""
+    documents = {language: made(partial(text, language=language)) for language in LANGUAGES}
+    blocks = (block for section in documents[LANGUAGES[0]].sections for block in section.blocks)
+    draw = [cache(block.draw) for block in blocks if isinstance(block, Figure)]
+    return {language: _drawn_by(iter(draw), document) for language, document in documents.items()}
+
+
+def _drawn_by(draw: Iterator[Callable[[], bytes]], document: Document) -> Document:
     sections = (
         replace(
             section,
             blocks=tuple(
-                replace(block, draw=partial(bytes, block.draw())) if isinstance(block, Figure) else block
+                replace(block, draw=next(draw)) if isinstance(block, Figure) else block
                 for block in section.blocks
             ),
         )

@@ -17,7 +17,7 @@ from calib.estimation.result import LeaveOneOut, LeverArmEstimate, ParameterEsti
 from calib.estimation.runs import Run
 from calib.identification import CaptureSummary, IdentificationResult, scatter
 from calib.lever_arms.gauge import LeverArms
-from calib.messages import english, message
+from calib.messages import Message, english, message, verbatim
 from calib.reports import figures
 from calib.reports.document import (
     Block,
@@ -30,15 +30,15 @@ from calib.reports.document import (
     Table,
     sanitise,
 )
-from calib.reports.format import counted, decimals, mm, three_digits
+from calib.reports.format import decimals, mm, three_digits
 from calib.reports.html import as_html
 from calib.reports.text import blocks_text
-from calib.reports.verdict import redundancy_mark, scatter_mark, verdict
+from calib.reports.verdict import redundancy_mark, rest_motion, scatter_mark, verdict
 from imudrv.arrays import Array
 from imudrv.units import ARCSEC, DEG, DEG_PER_H, MM, PPM, STANDARD_GRAVITY, UG, URAD
 
 
-def document(identification: IdentificationResult, arms: Sequence[LeverArms]) -> Document:
+def document(identification: IdentificationResult, arms: Sequence[LeverArms], say: Say = english) -> Document:
     """Return the report of an identification.
 
     Parameters
@@ -47,23 +47,28 @@ def document(identification: IdentificationResult, arms: Sequence[LeverArms]) ->
         Result of the identification.
     arms : sequence of LeverArms
         The lever arms in each gauge to be shown, the requested one first.
+    say : callable
+        Language of the report; the words within figures are English.
 
     Returns
     -------
     Document
     """
+    unit, result = identification.prior_calibration.calibration.serial_number, identification.result
+    sections = (
+        (message("report_result"), result_blocks(identification, arms, say)),
+        (message("report_inputs"), _inputs(identification, say)),
+        (message("report_rotations"), _rotations(identification, say)),
+        (message("report_rejected"), _rejected(identification.sources, say)),
+        (message("report_velocities"), _velocities(result, say)),
+        (message("report_estimate"), _estimate(identification, say)),
+        (message("report_limits"), map(Paragraph, map(say, _limits(identification, arms[0])))),
+    )
+    created = f"{identification.created:%Y-%m-%d %H:%M}"
     return Document(
-        f"Inner lever arms of unit {sanitise(identification.prior_calibration.calibration.serial_number)}",
-        f"Identification of {identification.created:%Y-%m-%d %H:%M} UTC, {identification.software}",
-        (
-            Section("Result", tuple(result_blocks(identification, arms))),
-            Section("Input data", tuple(_inputs(identification))),
-            Section("Rotations", tuple(_rotations(identification))),
-            Section("Rejected motions", tuple(_rejected(identification.sources))),
-            Section("Velocity before and after compensation", tuple(_velocities(identification.result))),
-            Section("The estimate", tuple(_estimate(identification))),
-            Section("Limits", tuple(Paragraph(text) for text in _limits(identification, arms[0]))),
-        ),
+        say(message("certificate_subtitle", unit=sanitise(unit))),
+        say(message("report_subtitle", created=created, software=identification.software)),
+        tuple(Section(say(title), tuple(blocks)) for title, blocks in sections),
     )
 
 
@@ -116,7 +121,7 @@ def result_blocks(
     iterator of Block
     """
     result = identification.result
-    yield KeyValues(tuple((mark, say(text)) for mark, text in verdict(identification)))
+    yield KeyValues(tuple((mark, sanitise(say(text))) for mark, text in verdict(identification)))
     yield Paragraph(say(message("u_and_U")))
     for one in arms:
         yield _arms_table(one, say)
@@ -160,86 +165,131 @@ def _arms_table(arms: LeverArms, say: Say = english) -> Table:
     )
 
 
-def _inputs(identification: IdentificationResult) -> Iterator[Block]:
+def _inputs(identification: IdentificationResult, say: Say) -> Iterator[Block]:
     prior, site, result = identification.prior_calibration, identification.site, identification.result
-    gravity = "normal gravity" if site.gravity_m_s2 is None else f"gravity {site.gravity_m_s2:.6f} m/s^2"
-    yield KeyValues(
-        (
-            ("unit", sanitise(prior.calibration.serial_number)),
-            ("calibration", f"{sanitise(prior.name)} of {prior.calibration.created:%Y-%m-%d}"),
-            ("SHA-256", prior.sha256),
-            (
-                "site",
-                f"latitude {site.latitude_deg:.6f} deg, longitude {site.longitude_deg:.6f} deg, "
-                f"height {site.height_m:.1f} m, {gravity}",
-            ),
-            ("method", _METHODS[result.method]),
-            ("pivot", "at rest at the origin of the body frame" if result.gauge == "given" else "unknown"),
-        )
+    position = message(
+        "site_position",
+        latitude_deg=site.latitude_deg,
+        longitude_deg=site.longitude_deg,
+        height_m=site.height_m,
+    )
+    gravity = message("gravity_normal", gravity_m_s2=site.gravity)
+    if site.gravity_m_s2 is not None:
+        gravity = message("gravity_measured", gravity_m_s2=site.gravity)
+    created = f"{prior.calibration.created:%Y-%m-%d}"
+    yield _pairs(
+        say,
+        (message("item_serial_number"), verbatim(prior.calibration.serial_number)),
+        (message("report_calibration"), message("report_file_of", name=prior.name, created=created)),
+        (message("report_sha256"), verbatim(prior.sha256)),
+        (message("site"), position),
+        (message("local_gravity"), gravity),
+        (message("report_method"), _METHODS[result.method]),
+        (message("report_pivot"), _PIVOTS[result.gauge]),
     )
     for source in identification.sources:
-        warm = ", ".join(
-            f"{channel.replace('_', ' ')} {least:.1f} to {most:.1f}"
-            for channel, least, most in source.temperatures
+        parts = [source.name, source.profile] + ([source.channel] if source.channel else [])
+        warm = tuple(
+            message("report_temperature", channel=channel.replace("_", " "), low_degc=low, high_degc=high)
+            for channel, low, high in source.temperatures
         )
-        parts = [source.name, source.profile] + ([f"channel {source.channel}"] if source.channel else [])
-        yield KeyValues(
-            (
-                ("capture", sanitise(", ".join(parts))),
-                ("SHA-256", source.sha256),
-                ("contents", f"{source.rotations.segments.duration_s:.1f} s; {source.counts}"),
-                ("temperature", f"{warm} degC" if warm else "not reported by the unit"),
-            )
+        yield _pairs(
+            say,
+            (message("report_capture"), verbatim(", ".join(parts))),
+            (message("report_sha256"), verbatim(source.sha256)),
+            (message("report_contents"), _contents(source)),
+            (message("temperature_of_unit"), _listed(warm) if warm else message("temperature_unknown")),
         )
 
 
-def _rotations(identification: IdentificationResult) -> Iterator[Block]:
-    limits = identification.limits
-    yield Paragraph(
-        f"A rotation is accepted if its angle is {limits.angle_deg:g} +- {limits.angle_tolerance_deg:g} deg, "
-        f"its peak rate at least {limits.least_peak_deg_per_s:g} deg/s, its axis at most "
-        f"{limits.axis_tilt_deg:g} deg off the vertical, the rest before it at least "
-        f"{limits.rest_before_s:g} s and the rest after it at least {limits.rest_after_s:g} s long, with at "
-        f"most {counted(limits.missing, 'missing sample')}, no saturation and no fault reported by the unit."
+def _pairs(say: Say, *rows: tuple[Message, Message]) -> KeyValues:
+    return KeyValues(tuple((sanitise(say(name)), sanitise(say(value))) for name, value in rows))
+
+
+def _listed(parts: tuple[Message, ...]) -> Message:
+    return message("reasons", reasons=parts)
+
+
+def _contents(source: CaptureSummary) -> Message:
+    counts = source.counts
+    others = (
+        (counts.reference, message("count_reference", n=counts.reference)),
+        (counts.damaged, message("count_damaged", n=counts.damaged)),
+        (counts.torn, message("count_torn", n=counts.torn)),
+        (counts.missing, message("count_missing", n=counts.missing)),
+        (counts.out_of_order, message("count_out_of_order", n=counts.out_of_order)),
+        (counts.duplicate, message("count_duplicate", n=counts.duplicate)),
+        (counts.invalid_counter, message("count_invalid_counter", n=counts.invalid_counter)),
+        (counts.restarts, message("count_restarts", n=counts.restarts)),
+        (counts.recovered, message("count_recovered", n=counts.recovered)),
     )
+    good = message("count_good", n=counts.good)
+    return message(
+        "report_samples",
+        duration_s=source.rotations.segments.duration_s,
+        expected=counts.expected,
+        parts=(good, *(part for n, part in others if n)),
+    )
+
+
+def _rotations(identification: IdentificationResult, say: Say) -> Iterator[Block]:
+    limits = identification.limits
+    accepted = message(
+        "rotation_limits",
+        angle_deg=limits.angle_deg,
+        tolerance_deg=limits.angle_tolerance_deg,
+        peak_deg_per_s=limits.least_peak_deg_per_s,
+        tilt_deg=limits.axis_tilt_deg,
+        before_s=limits.rest_before_s,
+        after_s=limits.rest_after_s,
+        missing=limits.missing,
+    )
+    yield Paragraph(say(accepted))
     for number, (run, result) in enumerate(
         zip(identification.runs, identification.result.runs, strict=True), start=1
     ):
-        yield KeyValues(((f"run {number}", sanitise(run.label)), *_rotation(run)))
-        yield from map(_velocity_and_design, result.turns)
-        yield Figure(
-            f"Run {number}. Grey: the turns. A constant offset comes from the pulse quantisation of the "
-            "first velocity",
-            partial(figures.velocities, run, result),
-        )
+        yield _pairs(say, (message("run", run=number), verbatim(run.label)), *_rotation(run))
+        for turn in result.turns:
+            yield _velocity_and_design(turn, say)
+        yield Figure(say(message("run_figure", run=number)), partial(figures.velocities, run, result))
 
 
-def _rotation(run: Run) -> Iterator[tuple[str, str]]:
+def _rotation(run: Run) -> Iterator[tuple[Message, Message]]:
     """Return what was detected of the turns of a run and its rests."""
     aligned, before = run.aligned, run.turns[0].before
-    yield "rest before", f"{before.duration_s:.1f} s; {counted(before.missing, 'missing sample')}"
-    for turn, label in zip(run.turns, run.turn_labels, strict=True):
-        yield (
-            f"turn {sanitise(label)}",
-            f"{turn.angle_deg:+.2f} deg about {turn.axis} up, {turn.duration_s:.2f} s, "
-            f"peak {turn.peak_deg_per_s:.1f} deg/s, axis {turn.axis_tilt_deg:.2f} deg off the vertical; "
-            f"then {turn.after.duration_s:.1f} s of rest; "
-            f"{counted(turn.missing + turn.after.missing, 'missing sample')}",
-        )
-        if not turn.accepted:
-            yield "outside the limits", "; ".join(map(english, turn.reasons))
     yield (
-        "alignment",
-        f"{aligned.duration_s:.1f} s: heading {aligned.heading_rad / DEG:.3f} deg, u "
-        f"{aligned.heading_sigma_rad / DEG:.3f} deg; level u {aligned.level_sigma_rad / ARCSEC:.1f} arcsec; "
-        f"{sanitise(str(aligned.motion)) if aligned.motion else 'no motion'}",
+        message("rest_before"),
+        message("rest_before_found", duration_s=before.duration_s, missing=before.missing),
     )
+    for turn, label in zip(run.turns, run.turn_labels, strict=True):
+        found = message(
+            "turn_found",
+            angle_deg=turn.angle_deg,
+            axis=turn.axis,
+            duration_s=turn.duration_s,
+            peak_deg_per_s=turn.peak_deg_per_s,
+            tilt_deg=turn.axis_tilt_deg,
+            rest_s=turn.after.duration_s,
+            missing=turn.missing + turn.after.missing,
+        )
+        yield message("turn", turn=label), found
+        if not turn.accepted:
+            yield message("outside_limits"), _listed(turn.reasons)
+    alignment = message(
+        "alignment_found",
+        duration_s=aligned.duration_s,
+        heading_deg=aligned.heading_rad / DEG,
+        heading_u_deg=aligned.heading_sigma_rad / DEG,
+        level_u_arcsec=aligned.level_sigma_rad / ARCSEC,
+        motion=rest_motion(aligned.motion) if aligned.motion else message("no_motion"),
+    )
+    yield message("source_alignment"), alignment
 
 
-def _velocity_and_design(turn: TurnResult) -> Table:
+def _velocity_and_design(turn: TurnResult, say: Say) -> Table:
     return Table(
-        f"V, mm/s, and H, m/s per m of each component, of turn {sanitise(turn.label)}",
-        ("", "east", "north", "up"),
+        say(message("velocity_table", turn=sanitise(turn.label))),
+        ("", *map(say, _DIRECTIONS)),
         (
             ("V", *(mm(v, "+.2f") for v in turn.V_n)),
             *(
@@ -251,27 +301,34 @@ def _velocity_and_design(turn: TurnResult) -> Table:
     )
 
 
-def _rejected(sources: Sequence[CaptureSummary]) -> Iterator[Block]:
+def _rejected(sources: Sequence[CaptureSummary], say: Say) -> Iterator[Block]:
     rejected = [(source.name, *one) for source in sources for one in source.rotations.rejected]
     for name, rotation, reasons in rejected:
-        yield KeyValues(
-            (
-                (
-                    "motion",
-                    f"{sanitise(name)} from {rotation.start_s:.1f} to {rotation.stop_s:.1f} s, "
-                    f"{rotation.angle_deg:+.1f} deg about {rotation.axis} up",
-                ),
-                *(("rejected", english(reason)) for reason in reasons),
-            )
+        motion = message(
+            "motion_found",
+            capture=name,
+            start_s=rotation.start_s,
+            stop_s=rotation.stop_s,
+            angle_deg=rotation.angle_deg,
+            axis=rotation.axis,
         )
+        why = ((message("motion_rejected"), reason) for reason in reasons)
+        yield _pairs(say, (message("motion"), motion), *why)
     if not rejected:
-        yield Paragraph("None: every motion in the captures is accepted.")
+        yield Paragraph(say(message("none_rejected")))
 
 
-def _velocities(result: LeverArmEstimate) -> Iterator[Block]:
+def _velocities(result: LeverArmEstimate, say: Say) -> Iterator[Block]:
+    head = (
+        message("column_turn"),
+        message("column_measured"),
+        message("column_residual"),
+        message("column_ratio"),
+        message("column_scatter"),
+    )
     yield Table(
-        "Horizontal velocity gained in each turn, mm/s",
-        ("turn", "measured", "residual", "ratio", "scatter"),
+        say(message("gained_table")),
+        tuple(map(say, head)),
         tuple(
             (
                 f"{number}  {sanitise(turn.label)}",
@@ -285,41 +342,43 @@ def _velocities(result: LeverArmEstimate) -> Iterator[Block]:
             )
         ),
     )
-    yield Paragraph(
-        "'Residual' is V - H R: only the size effect is subtracted; bias, tilt and misalignment remain. "
-        "'Scatter' is the rms of the residuals at rest about their mean."
-    )
-    yield Figure(
-        "Horizontal velocity before and after compensation", lambda: figures.before_after(result.turns)
-    )
+    yield Paragraph(say(message("gained_explained")))
+    yield Figure(say(message("gained_figure")), lambda: figures.before_after(result.turns))
 
 
 def _speed(v_n: Array) -> float:
     return hypot(v_n[0], v_n[1])
 
 
-def _estimate(identification: IdentificationResult) -> Iterator[Block]:
+def _estimate(identification: IdentificationResult, say: Say) -> Iterator[Block]:
     result = identification.result
-    yield from _observability(result, identification.priors.arm)
-    yield Paragraph(" ".join(map(english, (scatter_mark(result).text, redundancy_mark(result).text))))
-    yield _noise(result)
-    yield Table("Prior uncertainties", ("", "u"), tuple(priors_rows(identification.priors)))
+    yield from _observability(result, identification.priors.arm, say)
+    yield Paragraph(say(scatter_mark(result).text))
+    yield Paragraph(say(redundancy_mark(result).text))
+    noise = result.noise
+    yield _pairs(
+        say,
+        (message("gyros"), message("gyro_walk", walk=noise.angle_walk / DEG * 60.0)),
+        (message("accelerometers"), message("accelerometer_walk", walk=noise.velocity_walk * 60.0)),
+    )
+    priors = tuple((say(name), say(u)) for name, u in _priors(identification.priors))
+    yield Table(say(message("priors_table")), ("", "u"), priors)
     if result.parameters:
-        names = _names(result)
+        names = [say(name) for name in _names(result)]
         yield Table(
-            "Parameters estimated with the lever arms",
-            ("", "value", "u", "prior u", ""),
+            say(message("parameters_table")),
+            ("", say(message("value")), "u", say(message("prior_u")), ""),
             tuple(_parameter(n, name) for n, name in zip(result.parameters, names, strict=True)),
         )
-        yield _correlations(identification, names)
+        yield _correlations(identification, names, say)
     if result.leave_one_out:
-        yield _leave_one_out(result)
+        yield _leave_one_out(result, say)
 
 
-def _observability(result: LeverArmEstimate, arm_m: float) -> Iterator[Block]:
-    yield Paragraph(f"Observability. {result.reason[:1].upper()}{result.reason[1:]}.")
+def _observability(result: LeverArmEstimate, arm_m: float, say: Say) -> Iterator[Block]:
+    yield Paragraph(say(message("observability", reason=result.reason)))
     yield Table(
-        "Principal directions of (r_x, r_y, r_z): u, mm. Singular values of the stacked H: s, m/s per m",
+        say(message("directions_table")),
         ("", *(str(k) for k in range(1, 10))),
         (
             ("u", *(three_digits(s / MM) for s in result.direction_sigma)),
@@ -327,39 +386,23 @@ def _observability(result: LeverArmEstimate, arm_m: float) -> Iterator[Block]:
         ),
     )
     yield Figure(
-        f"Standard uncertainty of each direction; above {arm_m / MM:g} mm it is unobservable",
+        say(message("directions_figure", limit_mm=arm_m / MM)),
         lambda: figures.directions(result.direction_sigma, result.rank, arm_m),
     )
 
 
-def _noise(result: LeverArmEstimate) -> KeyValues:
-    noise = result.noise
-    return KeyValues(
-        (
-            (
-                "gyros",
-                f"angle random walk {noise.angle_walk / DEG * 60.0:.5f} deg/sqrt(h), from the alignments",
-            ),
-            (
-                "accelerometers",
-                f"horizontal: velocity random walk {noise.velocity_walk * 60.0:.5f} m/s/sqrt(h), from the "
-                "alignments",
-            ),
-        )
-    )
-
-
-def _leave_one_out(result: LeverArmEstimate) -> Table:
+def _leave_one_out(result: LeverArmEstimate, say: Say) -> Table:
+    head = say(message("column_without")), say(message("column_rank"))
     return Table(
-        "Largest change of r_x, r_y, r_z if one rotation is omitted, mm, and its u; p of its agreement",
-        ("without", "rank", "r_x", "u", "r_y", "u", "r_z", "u", "p"),
-        tuple((sanitise(one.label), str(one.rank), *_shifts(one)) for one in result.leave_one_out),
+        say(message("without_table")),
+        (*head, "r_x", "u", "r_y", "u", "r_z", "u", "p"),
+        tuple((sanitise(one.label), str(one.rank), *_shifts(one, say)) for one in result.leave_one_out),
     )
 
 
-def _shifts(one: LeaveOneOut) -> Iterator[str]:
+def _shifts(one: LeaveOneOut, say: Say) -> Iterator[str]:
     if one.shift_m is None or one.sigma_m is None or one.test is None:
-        yield from ("unobservable", "") * 3
+        yield from (say(message("unobservable")), "") * 3
         yield ""
         return
     for shift, sigma in zip(np.abs(one.shift_m), one.sigma_m, strict=True):
@@ -369,12 +412,12 @@ def _shifts(one: LeaveOneOut) -> Iterator[str]:
     yield f"{one.test.p_value:.2g}"
 
 
-def _correlations(identification: IdentificationResult, names: Sequence[str]) -> Table:
+def _correlations(identification: IdentificationResult, names: Sequence[str], say: Say) -> Table:
     correlation = identification.differences_correlation
     largest = np.argsort(-np.abs(correlation), axis=1)[:, :2]
     return Table(
-        "Correlation of the differences with these parameters: the two largest",
-        ("", "with", "rho", "with", "rho"),
+        say(message("correlation_table")),
+        ("", *(say(message("column_with")), "rho") * 2),
         tuple(
             (
                 f"r_x - r_{'yz'[row // 3]}, {'XYZ'[row % 3]}",
@@ -385,65 +428,48 @@ def _correlations(identification: IdentificationResult, names: Sequence[str]) ->
     )
 
 
-def _limits(identification: IdentificationResult, arms: LeverArms) -> Iterator[str]:
+def _limits(identification: IdentificationResult, arms: LeverArms) -> Iterator[Message]:
     if identification.result.gauge != "given":
-        yield (
-            "A common shift of the three sensing points is not known: rotations between rests determine only "
-            "their differences. The gauge fixes the origin of the body frame. Another gauge changes "
-            "compensated data by a rigid lever arm and does not change the velocity at rest."
-        )
+        yield message("limit_shift")
         if arms.gauge == "given":
-            yield "Gauge given: one sensing point was specified, and is taken as exact."
+            yield message("limit_given")
     else:
-        yield (
-            "All nine components assume that the pivot is at rest at the origin of the body frame. A pivot "
-            "that moves with the rotation appears as a common shift of the three points."
-        )
-    yield (
-        "The uncertainties include what is in the model: noise as estimated in the rests, and biases, scale "
-        "factors and misalignments within their priors. They do not include bending of body or mount, a "
-        "reference that moves during the rests, or dither in the gyro increments."
-    )
-    yield (
-        "The lever arms belong to this unit and to the calibration named above; with another C_ba or other "
-        "scale factors, repeat the identification. They are valid at the temperatures above only."
-    )
+        yield message("limit_pivot")
+    yield message("limit_model")
+    yield message("limit_unit")
 
 
-def priors_rows(priors: Priors) -> Iterator[tuple[str, str]]:
+def _priors(priors: Priors) -> Iterator[tuple[Message, Message]]:
     """Return names and values of the priors, in the usual units."""
     if priors.covariance is not None:
-        yield "biases, scales, misalignments", "covariance of the certificate"
+        yield message("biases_scales_misalignments"), message("covariance_of_certificate")
     else:
-        yield "accelerometer bias", f"{priors.accelerometer_bias / UG:g} ug"
-        yield "accelerometer scale", f"{priors.accelerometer_scale / PPM:g} ppm"
-        yield "accelerometer misalignment", f"{priors.accelerometer_misalignment / URAD:g} urad"
-        yield "gyro bias", f"{priors.gyro_bias / DEG_PER_H:g} deg/h"
-        yield "gyro scale", f"{priors.gyro_scale / PPM:g} ppm"
-        yield "gyro misalignment", f"{priors.gyro_misalignment / URAD:g} urad"
-    yield "accelerometer bias from run to run", f"{priors.accelerometer_bias_of_run / UG:g} ug"
-    yield "gyro bias from run to run", f"{priors.gyro_bias_of_run / DEG_PER_H:g} deg/h"
-    skew = f"{priors.skew * 1e3:g} ms"
-    yield (
-        "gyro-accelerometer skew",
-        skew if not priors.expected_skew else f"{skew} about {priors.expected_skew * 1e3:g} ms",
-    )
+        yield message("source_accelerometer_bias"), verbatim(f"{priors.accelerometer_bias / UG:g} ug")
+        yield message("source_accelerometer_scale"), verbatim(f"{priors.accelerometer_scale / PPM:g} ppm")
+        misalignment = verbatim(f"{priors.accelerometer_misalignment / URAD:g} urad")
+        yield message("source_accelerometer_misalignment"), misalignment
+        yield message("source_gyro_bias"), verbatim(f"{priors.gyro_bias / DEG_PER_H:g} deg/h")
+        yield message("source_gyro_scale"), verbatim(f"{priors.gyro_scale / PPM:g} ppm")
+        yield message("source_gyro_misalignment"), verbatim(f"{priors.gyro_misalignment / URAD:g} urad")
+    bias, drift = priors.accelerometer_bias_of_run / UG, priors.gyro_bias_of_run / DEG_PER_H
+    yield message("of_run", name=message("source_accelerometer_bias")), verbatim(f"{bias:g} ug")
+    yield message("of_run", name=message("source_gyro_bias")), verbatim(f"{drift:g} deg/h")
+    skew = verbatim(f"{priors.skew * 1e3:g} ms")
+    if priors.expected_skew:
+        skew = message("skew_about", skew_ms=priors.skew * 1e3, expected_ms=priors.expected_skew * 1e3)
+    yield message("source_skew"), skew
 
 
-def _names(result: LeverArmEstimate) -> list[str]:
-    """Return readable names of the parameters, with runs by number."""
-    runs = {run.label: f"run {k + 1}" for k, run in enumerate(result.runs)}
-    tilts = {"east": "tilt about east", "north": "tilt about north", "up": "heading"}
-    names = []
+def _names(result: LeverArmEstimate) -> Iterator[Message]:
+    """Yield readable names of the parameters, with runs by number."""
+    numbers = {run.label: k + 1 for k, run in enumerate(result.runs)}
     for parameter in result.parameters:
         head, _, part = parameter.name.rpartition("_")
         kind, _, label = head.partition(" ")
-        if label in runs:
-            kind = kind.replace("_", " ")
-            names.append(f"{runs[label]} {tilts[part] if kind == 'phi' else f'{kind} {part}'}")
-        else:
-            names.append(parameter.name.replace("_", " "))
-    return names
+        name = _TILTS[part] if kind == "phi" else message("of_axis", name=_KINDS[kind], axis=part)
+        if kind == "skew":
+            name = _KINDS[kind]
+        yield message("parameter_of_run", run=numbers[label], name=name) if label in numbers else name
 
 
 def _parameter(n: ParameterEstimate, name: str) -> tuple[str, ...]:
@@ -466,7 +492,20 @@ def _unit(name: str) -> tuple[str, float]:
     return "urad", URAD
 
 
-_METHODS: Final = {
-    "joint": "joint estimate of the arms with biases, tilts and misalignments from all rests",
-    "plain": "plain V = H R, one velocity for each rotation",
+_METHODS: Final = {"joint": message("method_joint"), "plain": message("method_plain")}
+_PIVOTS: Final = {"given": message("pivot_at_rest"), "centroid": message("pivot_unknown")}
+_DIRECTIONS: Final = message("east_axis"), message("north_axis"), message("up_axis")
+_TILTS: Final = {
+    "east": message("tilt_about_east"),
+    "north": message("tilt_about_north"),
+    "up": message("heading"),
 }
+_KINDS: Final = {
+    "accelerometer_bias": message("source_accelerometer_bias"),
+    "accelerometer_matrix": message("accelerometer_matrix"),
+    "gyro_bias": message("source_gyro_bias"),
+    "gyro_matrix": message("gyro_matrix"),
+    "quadratic": message("quadratic"),
+    "skew": message("source_skew"),
+}
+"""Parameters by the beginning of their names."""

@@ -6,11 +6,12 @@ from typing import Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from calib.estimation.result import CONTRADICTION_P, ChiSquare, LeverArmEstimate
+from calib.estimation.result import CONTRADICTION_P, ChiSquare, LeverArmEstimate, dither_lines
 from calib.identification import IdentificationResult
-from calib.messages import Message, message, verbatim
+from calib.messages import Message, message
 from calib.reports.document import sanitise
-from imudrv.units import ARCSEC, DEG, MM
+from imudrv.nav.alignment import RestMotion
+from imudrv.units import DEG, MM
 
 Level: TypeAlias = Literal["good", "note", "caution", "bad"]
 LEVELS: Final[tuple[Level, ...]] = ("good", "note", "caution", "bad")
@@ -72,8 +73,8 @@ def _overall(result: LeverArmEstimate) -> Message:
 
 def _marks(identification: IdentificationResult) -> Iterator[Mark]:
     result = identification.result
-    for refusal in result.refusals:
-        yield Mark("bad", message("refused", why=verbatim(sanitise(refusal[0].upper() + refusal[1:]))))
+    for fault in result.faults:
+        yield Mark("bad", message("refused", why=fault))
     yield scatter_mark(result)
     yield redundancy_mark(result)
     if result.redundancy.degrees_of_freedom and result.leave_one_out:
@@ -86,8 +87,7 @@ def _marks(identification: IdentificationResult) -> Iterator[Mark]:
     yield from _site(identification)
     for k, run in enumerate(identification.runs):
         if run.aligned.motion is not None:
-            motion = verbatim(sanitise(str(run.aligned.motion)))
-            yield Mark("caution", message("run_moved", run=k + 1, motion=motion))
+            yield Mark("caution", message("run_moved", run=k + 1, motion=rest_motion(run.aligned.motion)))
         for turn, label in zip(run.turns, run.turn_labels, strict=True):
             if not turn.accepted:
                 yield Mark("note", message("turn_unused", turn=sanitise(label), reasons=tuple(turn.reasons)))
@@ -95,7 +95,12 @@ def _marks(identification: IdentificationResult) -> Iterator[Mark]:
         for restart_s in source.rotations.restarts_s:
             yield Mark("note", message("restarted", capture=sanitise(source.name), at_s=restart_s))
     for note in result.notes:
-        yield Mark("caution", verbatim(f"{sanitise(note)}."))
+        yield Mark("caution", note)
+
+
+def rest_motion(moved: RestMotion) -> Message:
+    """Return when and how much a unit moved that should have been at rest."""
+    return message("rest_motion", begin_s=moved.begin_s, end_s=moved.end_s, times=moved.rms / moved.limit)
 
 
 def statistic(test: ChiSquare) -> Message:
@@ -169,21 +174,12 @@ def _dither(result: LeverArmEstimate) -> Iterator[Mark]:
     """Yield what dither was found in the increments."""
     for run in result.runs:
         if run.lines:
-            lines = tuple(
-                message(
-                    "dither_of_gyro",
-                    amplitude_arcsec=line.amplitude_rad / ARCSEC,
-                    frequency_hz=line.frequency_hz,
-                    axis=line.axis,
-                )
-                for line in run.lines
-            )
             yield Mark(
                 "note",
                 message(
                     "dither_found",
                     run=sanitise(run.label),
-                    lines=lines,
+                    lines=dither_lines(run),
                     filter=run.rate_filter,
                     error_sigma=result.dither_error,
                 ),

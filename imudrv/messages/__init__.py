@@ -42,3 +42,8 @@ def catalogue(language: str, package: str = __name__) -> Mapping[str, str]:
     content = resources.files(package).joinpath(f"{language}.yaml").read_bytes()
     texts: dict[str, str] = yaml.safe_load(content)
     return texts
+
+
+def named(texts: Mapping[str, str], kind: str, name: str) -> str:
+    """Return the text of one of the names of a kind, such as ``disk full``; any other text as it is."""
+    return texts.get(f"{kind}_{name.replace(' ', '_')}", name)

@@ -14,7 +14,7 @@ from rich.text import Text
 
 from imudrv.errors import InputError
 from imudrv.imu.clock import STALL_EDGES_S
-from imudrv.messages import catalogue
+from imudrv.messages import catalogue, named
 from imudrv.service.status import Status
 from imudrv.service.status_socket import ask
 
@@ -55,7 +55,9 @@ def monitor(path: Path, console: Console, language: str) -> None:
             try:
                 live.update(view(Status.from_json(ask(path)), language), refresh=True)
             except InputError as error:
-                live.update(Panel(Text(str(error), "red"), title="no service"), refresh=True)
+                live.update(
+                    Panel(Text(str(error), "red"), title=catalogue(language)["page_no_service"]), refresh=True
+                )
 
 
 def view(status: Status, language: str = "en") -> RenderableType:
@@ -66,14 +68,15 @@ def view(status: Status, language: str = "en") -> RenderableType:
     status : Status
         Status of a service.
     language : str
-        Language of the rows; reasons and events are English.
+        Language; events are shown as they were logged, in English.
 
     Returns
     -------
     renderable
     """
     health = Text(f" {status.health.upper()} ", f"bold white on {_COLOURS[status.health]}")
-    health.append("  " + "; ".join(status.reasons or ["no problems"]), "default on default")
+    reasons = status.reasons(language) or [catalogue(language)["page_no_problems"]]
+    health.append("  " + "; ".join(reasons), "default on default")
     table = Table.grid(padding=(0, 2), expand=True)
     table.add_column(style="bold", no_wrap=True)
     table.add_column(ratio=1)
@@ -94,7 +97,11 @@ def _line_rows(status: Status, texts: Mapping[str, str]) -> Iterator[Row]:
     port, samples = status.port, status.samples
     unit = {"unit": status.unit, "profile": status.profile, "calibration": status.calibration.sha256[:12]}
     yield texts["unit"], texts["unit_value"].format(**unit), ""
-    opened = {"url": port.url, "state": port.state, "reconnects": port.reconnects}
+    opened = {
+        "url": port.url,
+        "state": named(texts, "port", port.state),
+        "reconnects": port.reconnects,
+    }
     yield texts["port"], texts["port_value"].format(**opened), ""
     rate = {"rate_hz": status.rate_hz, "nominal_rate_hz": status.nominal_rate_hz, "good": samples.good}
     yield texts["rate"], texts["rate_value"].format(**rate), ""
@@ -102,7 +109,8 @@ def _line_rows(status: Status, texts: Mapping[str, str]) -> Iterator[Row]:
     losses = ", ".join(f"{count} {texts[name]}" for name, count in counts.items() if count)
     yield texts["losses"], losses or texts["none"], "yellow" if losses else ""
     if status.rejected:
-        rejected = (f"{entry.runs} {name.replace('_', ' ')}" for name, entry in status.rejected.items())
+        counted = ((entry.runs, named(texts, "rejected", name)) for name, entry in status.rejected.items())
+        rejected = (f"{runs} {reason}" for runs, reason in counted)
         yield texts["rejected"], ", ".join(rejected), "yellow"
 
 
@@ -132,7 +140,8 @@ def _unit_rows(status: Status, texts: Mapping[str, str]) -> Iterator[Row]:
 
 def _output_rows(status: Status, texts: Mapping[str, str]) -> Iterator[Row]:
     for sink in [*status.sinks, *([status.recording] if status.recording else [])]:
-        yield sink.url[-24:], texts["output_value"].format(**sink._asdict()), "" if sink.healthy else "red"
+        values = sink._asdict() | {"state": named(texts, "output", sink.state)}
+        yield sink.url[-24:], texts["output_value"].format(**values), "" if sink.healthy else "red"
 
 
 def _sample_rows(status: Status, texts: Mapping[str, str]) -> Iterator[Row]:

@@ -1,5 +1,6 @@
 """Status of a running service, and the health that follows from it."""
 
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Final, Self
 
@@ -9,6 +10,7 @@ from pydantic import TypeAdapter, ValidationError
 from imudrv.errors import InputError
 from imudrv.imu.clock import ClockReport
 from imudrv.imu.sequence import SampleCounts
+from imudrv.messages import LANGUAGES, catalogue, named
 from imudrv.records import Flag, Records
 from imudrv.service.latency import LatencyReport
 from imudrv.service.status_socket import FORMAT, VERSION
@@ -179,39 +181,45 @@ class Status:
     events: list[str]
 
     @property
-    def failures(self) -> list[str]:
-        """Reasons why no valid samples are output, or none are recorded."""
-        failures = []
-        if self.port.state not in ("streaming", "ended"):
-            failures.append(f"port {self.port.state}: {self.port.trouble or self.port.url}")
-        if not self.samples.closes:
-            failures.append("the sample counts do not add up: a defect of this product, please report it")
-        if self.recording and not self.recording.healthy:
-            failures.append(f"recording {self.recording.url}: {self.recording.state}")
-        return failures
-
-    @property
-    def warnings(self) -> list[str]:
-        """What a person should look at although samples are output."""
-        warnings = [f"unit: {name}" for name in self.unit_status.faults]
-        warnings += [f"{sink.url}: {sink.state}" for sink in self.sinks if not sink.healthy]
-        if self.port.users:
-            warnings.append(f"port also open in {', '.join(self.port.users)}")
-        if self.samples.lost_last_s:
-            warnings.append(f"{self.samples.lost_last_s} samples lost in the last second")
-        if self.port.state == "streaming" and not self.clock.locked:
-            warnings.append("clock not locked yet")
-        return warnings + self.notices
-
-    @property
     def health(self) -> str:
         """``fail`` if there are failures, ``warn`` if there are warnings only, else ``ok``."""
-        return "fail" if self.failures else "warn" if self.warnings else "ok"
+        texts = catalogue(LANGUAGES[0])
+        return "fail" if any(self._failures(texts)) else "warn" if any(self._warnings(texts)) else "ok"
 
-    @property
-    def reasons(self) -> list[str]:
-        """Reasons of `health`, failures first."""
-        return self.failures + self.warnings
+    def reasons(self, language: str = LANGUAGES[0]) -> list[str]:
+        """Return the reasons of `health` in one of the languages, failures first.
+
+        Notices, and what a port or an output reports in words of its own, stay English.
+        """
+        texts = catalogue(language)
+        return [*self._failures(texts), *self._warnings(texts)]
+
+    def _failures(self, texts: Mapping[str, str]) -> Iterator[str]:
+        """Yield why no valid samples are output, or none are recorded."""
+        port, recording = self.port, self.recording
+        if port.state not in ("streaming", "ended"):
+            state = named(texts, "port", port.state)
+            yield texts["reason_port"].format(state=state, trouble=port.trouble or port.url)
+        if not self.samples.closes:
+            yield texts["reason_counts"]
+        if recording and not recording.healthy:
+            state = named(texts, "output", recording.state)
+            yield texts["reason_recording"].format(path=recording.url, state=state)
+
+    def _warnings(self, texts: Mapping[str, str]) -> Iterator[str]:
+        """Yield what a person should look at although samples are output."""
+        for name in self.unit_status.faults:
+            yield texts["reason_unit"].format(fault=name)
+        for sink in self.sinks:
+            if not sink.healthy:
+                yield texts["reason_output"].format(url=sink.url, state=named(texts, "output", sink.state))
+        if self.port.users:
+            yield texts["reason_users"].format(programs=", ".join(self.port.users))
+        if self.samples.lost_last_s:
+            yield texts["reason_lost"].format(samples=self.samples.lost_last_s)
+        if self.port.state == "streaming" and not self.clock.locked:
+            yield texts["reason_clock"]
+        yield from self.notices
 
     def to_json(self) -> dict[str, Any]:
         """Return the JSON document of the status socket and of recordings."""
@@ -226,7 +234,7 @@ class Status:
             "sinks": [sink._asdict() for sink in self.sinks],
             "recording": self.recording._asdict() if self.recording else None,
             "health": self.health,
-            "reasons": self.reasons,
+            "reasons": self.reasons(),
         }
 
     @classmethod

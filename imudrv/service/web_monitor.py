@@ -88,7 +88,7 @@ def _frame(path: Path) -> dict[str, Any]:
     return {
         "kind": "status",
         "health": status.health,
-        "reasons": status.reasons,
+        "reasons": {name: status.reasons(name) for name in LANGUAGES},
         "rows": {name: list(rows(status, name)) for name in LANGUAGES},
         "latency": octaves(status.latency.histogram),
         "rate": float(np.linalg.norm(last.dtheta_b)) / seconds / DEG,

@@ -18,7 +18,7 @@ from calib.identification import IdentificationResult, PriorCalibration, identif
 from calib.lever_arms.gauge import convert
 from calib.messages import LANGUAGES, message
 from calib.reports.certificate import Particulars, documents
-from calib.reports.document import Document, Paragraph, Table
+from calib.reports.document import MARKS, Document, KeyValues, Paragraph, Table
 from calib.reports.html import as_html
 from calib.reports.pdf import BROWSERS, write_pdf
 from imudrv.arrays import Array
@@ -245,3 +245,18 @@ def test_a_plan_of_an_older_version_has_no_bench_and_no_operator() -> None:
     older = from_json(line)
     assert isinstance(older, Plan)
     assert (older.bench, older.operator) == (None, "")
+
+
+def test_everything_on_a_chinese_certificate_but_names_is_chinese(made: Made) -> None:
+    certificate, words = made[1]["zh_CN"], []
+    for section in certificate.sections:
+        words.append(section.title)
+        for block in section.blocks:
+            if isinstance(block, KeyValues):
+                words += [name for name, _ in block.rows if name not in MARKS]
+            else:
+                words.append(block.text if isinstance(block, Paragraph) else block.title)
+    assert [one for one in words if not re.search("[一-鿿]", one)] == 4 * [
+        "SHA-256"
+    ]  # of the calibration and three captures
+    assert len(words) > 80

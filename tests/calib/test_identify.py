@@ -19,6 +19,7 @@ from calib.estimation.predict import PlannedRotation, predict
 from calib.estimation.priors import Priors
 from calib.estimation.result import CENTROID_BASIS, TO_DIFFERENCES, LeverArmEstimate
 from calib.estimation.runs import NavigationOptions, Run, navigate_capture, navigate_rotations
+from calib.messages import english
 from calib.validation import montecarlo
 from calib.validation.bound import sigma_over_bound
 from calib.validation.montecarlo import Budget
@@ -81,7 +82,7 @@ def test_joint_finds_the_arms_of_the_reference_captures(captured: tuple[list[Run
     assert rms_mm(found, truth) < 0.045  # the requirement; 0.008 found
     assert found.rank == 6
     # one direction is that in which a skew of the size of its prior acts, the unit 0.1 m off the axis
-    assert found.reason.startswith("rank 6: the observable directions have a sigma of at most 0.1")
+    assert english(found.reason).startswith("rank 6: the observable directions have a sigma of at most 0.1")
     assert found.direction_sigma[4] < 0.03 * MM
     assert found.direction_sigma[6] > 1.0
     error = found.differences.ravel() - TO_DIFFERENCES @ truth.ravel()

@@ -213,7 +213,9 @@ def test_dither_in_the_increments_is_a_bad_verdict_with_the_remedy(
     marks = marks_of(identification, runs=(shaken, *runs[1:]), dither_error=8.0)
     bad = [text for mark, text in marks[1:] if mark == "bad"]
     assert len(bad) == 1
-    assert bad[0].startswith("The gyro increments carry dither or vibration (3 arcsec at 150 Hz about X)")
+    assert bad[0].startswith(
+        "No certificate is made: the gyro increments carry dither or vibration (3 arcsec at 150 Hz about X)"
+    )
     assert "H is 0.07 m/s per m" in bad[0]
     assert "which costs 8 sigma, expected at most 0.1" in bad[0]
     assert "let the unit remove its dither" in bad[0]

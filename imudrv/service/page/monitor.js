@@ -54,7 +54,7 @@ function draw() {
   if (lost) $("health").textContent = label("lost");
   else if (gone) $("health").textContent = `${label("no_service")}: ${frame.text}`;
   else if (frame)
-    $("health").textContent = `${label(frame.health)}  ${frame.reasons.join("; ") || label("no_problems")}`;
+    $("health").textContent = `${label(frame.health)}  ${frame.reasons[language].join("; ") || label("no_problems")}`;
   if (!frame || gone) return;
   $("rows").replaceChildren();
   for (const [name, text, kind] of frame.rows[language]) {
