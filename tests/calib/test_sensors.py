@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from calib.detection.rest_bins import Noise
 from calib.estimation.dither_line import DitherLine
 from calib.procedure.plan import load as load_procedure
 from calib.procedure.schema import Procedure
-from calib.sensors.adjustment import Free
+from calib.sensors.adjustment import Free, Wander, _wander, _whole_basis, covariance_of
 from calib.sensors.calibrate import SensorsOptions, calibrate_sensors, named_poses
 from calib.sensors.calibrate import solve as solve_evidence
 from calib.sensors.certificate import certificate, result_document
@@ -32,7 +33,7 @@ from imudrv.nav.attitude import rotation
 from imudrv.records import Flag, Records
 from imudrv.sensor_calibration import number_paths
 from imudrv.site import Site
-from imudrv.units import ARCSEC
+from imudrv.units import ARCSEC, UG
 from imudrv.wire.encode import StreamEncoder
 from tools.psins_to_wire import FLOAT_PROFILE, convert
 from tools.sensors_accuracy import errors, golden_truth
@@ -351,6 +352,16 @@ def rest_starts(session: Records) -> list[int]:
             return starts
         starts.append(ends[0] * 10)
         at = ends[0] * 10 + int(0.8 * REST_S * RATE)
+
+
+def test_a_wander_that_few_residuals_show_counts_for_more_than_its_likely_size(result):
+    found, rng = result.adjustment, np.random.default_rng(3)
+    Z = _whole_basis(Free(), len(found.attitudes))
+    root = np.linalg.cholesky(covariance_of(found.system, Wander(0.0, 5.0 * UG)))
+    draws = (replace(found.system, residual=root @ rng.standard_normal(len(root))) for _ in range(60))
+    sizes = [_wander(one, Z, found.p, found.p.gravity, 1e-5).accelerometer / UG for one in draws]
+    # 8 degrees of freedom: 5 ug sqrt(8 / 6) = 5.8, known to 4 % from 60 draws
+    assert 5.1 < np.sqrt(np.mean(np.square(sizes))) < 6.5
 
 
 # Rests that are none, and losses
