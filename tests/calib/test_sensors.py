@@ -520,6 +520,31 @@ def test_frames_lost_while_carried_cost_that_motion(solve, session, result):
     assert scales[1] > scales[0]
 
 
+def test_a_restart_of_the_unit_costs_the_motion_and_is_named(solve, session, result):
+    at = rest_starts(session)[6] - 150  # while it is carried to the seventh rest
+    after = session[at + 100 :].copy()
+    after["counter"] -= after["counter"][0]  # as of a unit that was switched on again
+    found = solve(np.concatenate([session[:at], after]))
+
+    assert len(found.evidence.rests) == 12
+    assert [(link.before, link.after) for link in found.evidence.links] == [
+        (k, k + 1) for k in range(11) if k != 5
+    ]
+    (left,) = found.evidence.left
+    assert left.reason == "the unit restarted: attitude and velocity are not carried over it"
+    assert left.start_s == pytest.approx(at / RATE, abs=0.1)
+    assert found.evidence.captures == (0, 0)
+    document = result_document(found)
+    assert document["left_out"][0]["capture"] == "session-0.raw"
+    assert len(document["sensors"]["captures"]) == 1
+    change = [
+        abs(a.value - b.value) / b.sigma
+        for a, b in zip(result.estimates, found.estimates, strict=True)
+        if a.is_shown
+    ]
+    assert max(change) < 2.0  # the same rests, but for one motion
+
+
 def test_frames_lost_at_rest_leave_its_longer_part(solve, session):
     at = rest_starts(session)[6] + 2 * RATE
     found = solve(np.delete(session, slice(at, at + 3)))
