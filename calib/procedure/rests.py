@@ -51,6 +51,7 @@ class PlacingForRest(Placing):
     def feed(self, block: Block) -> Outcome | None:
         """Go to the step whose pose the unit is in."""
         p = self.progress
+        tell_restart(p, block)
         if not p.observation.placed and p.stillness.quiet_s >= READY_S and self._is_elsewhere():
             return Outcome.NEXT_STEP
         if not self.was_moved and any(reason.key == "turn_differs" for reason in p.last_try):
@@ -167,6 +168,8 @@ class LongRest(PhaseState):
         if self._first < 0:
             self._first = int(block.rows["counter"][0])
         self._count += len(block.rows)
+        if block.restarted:  # its numbers begin anew
+            self._first, self._count = int(block.rows["counter"][0]), len(block.rows)
         if cause := p.disturbance(block):
             p.elapsed_s -= block.seconds
             if not self._is_disturbed:
@@ -206,8 +209,20 @@ def accept(p: Progress, first: int, samples: int, rest_s: float) -> None:
     p.bells += 1
 
 
+def tell_restart(p: Progress, block: Block) -> None:
+    """Tell the operator that the unit restarted between two rests; what is accepted remains."""
+    if block.restarted and p.accepted:
+        p.tell(message("restarted_on_the_way"))
+
+
 class RestVerdict(Verdict):
     """The verdict on a rest."""
+
+    def feed(self, block: Block) -> Outcome | None:
+        """Wait."""
+        outcome = super().feed(block)
+        tell_restart(self.progress, block)
+        return outcome
 
     def rejection(self) -> Prompt:
         """Return what to do after a rejection."""
