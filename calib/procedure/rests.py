@@ -99,6 +99,7 @@ class Resting(PhaseState):
         self._waiting: list[Array] = []
         self._sums: list[Array] = []
         self._means: list[Array] = []
+        self._degc: list[list[float]] = []
         self._first = -1
         self._count = 0
 
@@ -128,6 +129,8 @@ class Resting(PhaseState):
         sums, means = binned(rows[:whole], self._samples)
         self._sums.append(sums)
         self._means.append(means)
+        if known := [degc for degc in self.progress.status.temperature_degc.values() if degc is not None]:
+            self._degc.append(known)
 
     def _judge(self) -> Outcome:
         """Accept the rest, or reject it where it was none, or not in its pose."""
@@ -135,7 +138,8 @@ class Resting(PhaseState):
         bin_s = self._samples * p.interval_s
         sums, means = np.concatenate(self._sums), np.concatenate(self._means)
         degc = np.full(4, np.nan)
-        rest = RestBins(0, self._first, p.counter + 1, 0.0, bin_s, self._samples, sums, means, degc)
+        span_k = max((max(of_one) - min(of_one) for of_one in zip(*self._degc, strict=False)), default=0.0)
+        rest = RestBins(0, self._first, p.counter + 1, 0.0, bin_s, self._samples, sums, means, degc, span_k)
         known = coefficients(p.calibration)
         pulse = 1.0 / float(known.accelerometer_scale.mean()) if known.accelerometer_in_pulses else 0.0
         if drift := rest.drift(rest_noise([rest.steady]), pulse):

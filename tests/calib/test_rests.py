@@ -9,6 +9,7 @@ import pytest
 from calib.messages import english
 from calib.procedure.engine import Engine
 from calib.procedure.events import (
+    Conditions,
     Confirm,
     Entered,
     Event,
@@ -139,6 +140,21 @@ def test_a_rest_on_a_plate_that_sinks_is_asked_for_again(site: Site, bench: Benc
     assert drive.accepted == []
     assert drive.why[0].startswith("its force changed by 1")
     assert "arcsec" in drive.why[0]
+
+
+@pytest.mark.parametrize(("axis", "kelvin", "accepted"), [(2, 0.5, True), (2, 0.0, False), (0, 0.5, False)])
+def test_a_force_along_gravity_that_changes_with_the_temperature_is_no_tilt(
+    site: Site, bench: Bench, step: Any, axis: int, kelvin: float, accepted: bool
+) -> None:
+    samples = bench(step(CHECK_S + REST_S))
+    warm = np.clip((np.arange(len(samples)) * INTERVAL_NS * 1e-9 - CHECK_S) / REST_S, 0.0, 1.0)
+    samples["dv_b"][:, axis] += warm * 90.0 * UG * INTERVAL_NS * 1e-9
+    drive = Driver(site, plan(Z))
+    for at in range(0, len(samples), 500):  # once a second
+        drive.engine.update_status(Conditions((), {"gyro": 30.0 + kelvin * float(warm[at])}))
+        drive.feed(samples[at : at + 500])
+
+    assert drive.accepted == (["z"] if accepted else [])
 
 
 def test_a_wrong_side_is_named_and_another_pose_of_the_plan_counts(
