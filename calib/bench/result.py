@@ -15,6 +15,7 @@ from calib.bench.entries import AcceptedRest, ResidualVelocity
 from calib.bench.state import Attempt, SessionState
 from calib.certificate import certificate
 from calib.detection.blocks import BLOCK_NS
+from calib.detection.sections import split_at_restarts
 from calib.estimation.gains import velocity_gain
 from calib.estimation.joint import estimate_joint
 from calib.estimation.priors import certified_priors
@@ -200,18 +201,25 @@ def uncovered_rests(path: Path, rests: Sequence[AcceptedRest]) -> dict[str, str]
     layout = recording.profile.layout()
     is_counted = layout.sequence.kind is SequenceKind.COUNTER
     decoder, tracker = FrameDecoder(layout), SequenceTracker(layout)
-    found, total, offset = [0] * len(rests), 0, None
-    for reads in recording.reads():
-        counter = tracker.feed(decoder.feed_reads(reads.data, reads.ends, reads.times))["counter"]
-        total += len(counter)
-        if not len(counter) or not is_counted:
-            continue
-        if offset is None:
-            offset = _offset(recording, rests[-1].last_counter, int(counter[0]), layout)
-        number = (counter + offset) // layout.counter_step
+    pieces = (
+        tracker.feed(decoder.feed_reads(reads.data, reads.ends, reads.times)) for reads in recording.reads()
+    )
+    total, offset = 0, 0
+    covered: dict[int, list[int]] = {}  # samples of each rest between two restarts
+    for section, part in split_at_restarts(pieces, layout.counter_step):
+        total += len(part)
+        if section not in covered:
+            covered[section] = [0] * len(rests)
+            # at a restart the service, too, begins with the unit's own number
+            begins = is_counted and not section
+            offset = (
+                _offset(recording, rests[-1].last_counter, int(part["counter"][0]), layout) if begins else 0
+            )
+        number = (part["counter"] + offset) // layout.counter_step
         for k, rest in enumerate(rests):
             first, stop = np.searchsorted(number, [rest.first_counter, rest.last_counter + 1])
-            found[k] += int(stop - first)
+            covered[section][k] += int(stop - first)
+    found = [max(samples, default=0) for samples in zip(*covered.values(), strict=True)] or [0] * len(rests)
     if not is_counted:
         before = 0
         for k, rest in enumerate(rests):

@@ -5,7 +5,7 @@ A count at the edge of a rest is the mean over a bin of (count - rate t), which 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from math import sqrt
+from math import hypot, sqrt
 from typing import Final
 
 import numpy as np
@@ -21,6 +21,8 @@ LEAST_RESTS: Final = 3
 DRIFT_SIGMAS: Final = 5.0
 DRIFT_FLOOR: Final = 1.5 * UG
 """A rest moves if its force changes by more than this many sigma; the floor allows for wander, m/s^2."""
+VERTICAL_PER_K: Final = 200 * UG
+"""Change of a force upward that a kelvin explains, m/s^2: 100 ug of bias and 100 ppm of scale."""
 
 
 @dataclass(frozen=True)
@@ -112,6 +114,9 @@ class RestBins:
     def drift(self, noise: Noise, quantum: float) -> Message | None:
         """Return how the force changes from the first to the last quarter; None: within the noise.
 
+        A tilt changes the level part. The part along gravity may be that of a temperature that changes; the
+        level part may be so, too, but it cannot be distinguished from a tilt.
+
         Parameters
         ----------
         noise : Noise
@@ -122,7 +127,10 @@ class RestBins:
         n = max(2, len(self.sums) // 4)
         first = _rate(self.sums[:n], self.means[:n], self.bin_s)
         last = _rate(self.sums[-n:], self.means[-n:], self.bin_s)
-        change = float(np.linalg.norm((last - first)[3:]))
+        difference, up = (last - first)[3:], self.rate[3:] / np.linalg.norm(self.rate[3:])
+        upward = float(difference @ up)
+        unexplained = max(0.0, abs(upward) - VERTICAL_PER_K * self.span_k)
+        change = hypot(float(np.linalg.norm(difference - upward * up)), unexplained)
         seconds = (n - 1) * self.bin_s
         variance = 2.0 * (noise.velocity_walk**2 / seconds + 2.0 * (0.3 * quantum / seconds) ** 2)
         if change <= DRIFT_SIGMAS * sqrt(variance + DRIFT_FLOOR**2):

@@ -19,17 +19,19 @@ LONGEST_GAP_S: Final = 3600.0
 """Longest time without samples for which a unit is believed to have stayed on, s."""
 
 
-def split_at_restarts(pieces: Iterable[Records]) -> Iterator[tuple[int, Records]]:
+def split_at_restarts(pieces: Iterable[Records], counter_step: int = 1) -> Iterator[tuple[int, Records]]:
     """Divide a capture where the unit restarted.
 
     Parameters
     ----------
-    pieces : iterable of INCREMENTS
+    pieces : iterable of INCREMENTS or of pulses
         In the order of arrival.
+    counter_step : int
+        Step of the counter from sample to sample.
 
     Yields
     ------
-    (int, ndarray of INCREMENTS)
+    (int, ndarray)
         Number of the section, from 0, and samples of it.
     """
     section, newest = 0, None
@@ -38,7 +40,7 @@ def split_at_restarts(pieces: Iterable[Records]) -> Iterator[tuple[int, Records]
             continue
         counter = piece["counter"]
         steps = np.diff(counter, prepend=counter[0] - 1 if newest is None else newest)
-        longest = LONGEST_GAP_S / (float(np.median(piece["interval_ns"])) * NS)
+        longest = counter_step * LONGEST_GAP_S / (float(np.median(piece["interval_ns"])) * NS)
         newest = counter[-1]
         for k, part in enumerate(np.split(piece, np.flatnonzero((steps <= 0) | (steps > longest)))):
             section += k > 0

@@ -49,7 +49,7 @@ class Fit:
     value, sigma : ndarray, shape (5,)
         Coefficients and their standard uncertainties; NaN: not observable.
     below : ndarray, shape (5,)
-        Upper limits, 95 %.
+        Upper limits, 95 %, beside all other kinds.
     squares : ndarray, shape (5,)
         Squares of the coefficients of the fitted curve.
     deviation_sigma : ndarray, shape (n,)
@@ -121,9 +121,7 @@ def _fit(tau_s: Array, variance: Array, independent: Array, estimates: Estimates
     covariance = np.diag(variance**2 / independent)
     for round_ in range(1 + ROUNDS):
         root = _root(covariance)
-        whitened = solve_triangular(root, terms, lower=True)
-        size = np.linalg.norm(whitened, axis=0)
-        whitened /= size
+        whitened, size = _whitened(root, terms)
         squares, norm = nnls(whitened, solve_triangular(root, variance, lower=True))
         squares /= size
         degrees = len(tau_s) - int(np.count_nonzero(squares))
@@ -132,7 +130,7 @@ def _fit(tau_s: Array, variance: Array, independent: Array, estimates: Estimates
         covariance = estimates.matrix(squares)
     sigma = _sigma(whitened) / size
     observable = squares > SIGMAS * sigma  # beside all other kinds, also those that are not there
-    below = np.sqrt(squares + QUANTILE_95 * sigma)
+    limits = _limits(squares, sigma, terms, estimates)
     present = squares > 0.0
     sigma[present] = _sigma(whitened[:, present]) / size[present]
     observable[B] &= np.argmin(variance) < len(variance) - 1  # it may fall further
@@ -141,12 +139,33 @@ def _fit(tau_s: Array, variance: Array, independent: Array, estimates: Estimates
         tau_s,
         value,
         sigma / (2.0 * value),
-        below,
+        np.sqrt(limits),
         squares,
         np.sqrt(np.diag(covariance)) / (2.0 * np.sqrt(variance)),
         float(norm**2),
         degrees,
     )
+
+
+def _limits(squares: Array, sigma: Array, terms: Array, estimates: EstimatesCovariance) -> Array:
+    """Return the upper limits of the squares.
+
+    A noise that is as strong as its limit scatters more than the fitted one; its own scatter counts.
+    """
+    limits = np.empty_like(squares)
+    for k in range(len(squares)):
+        strong = squares.copy()
+        strong[k] += QUANTILE_95 * sigma[k]
+        whitened, size = _whitened(_root(estimates.matrix(strong)), terms)
+        limits[k] = squares[k] + QUANTILE_95 * (_sigma(whitened) / size)[k]
+    return limits
+
+
+def _whitened(root: Array, terms: Array) -> tuple[Array, Array]:
+    """Return the whitened terms of the model, scaled to unit length, and their lengths before that."""
+    whitened = solve_triangular(root, terms, lower=True)
+    size = np.linalg.norm(whitened, axis=0)
+    return whitened / size, size
 
 
 def _sigma(whitened: Array) -> Array:

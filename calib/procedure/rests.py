@@ -51,6 +51,7 @@ class PlacingForRest(Placing):
     def feed(self, block: Block) -> Outcome | None:
         """Go to the step whose pose the unit is in."""
         p = self.progress
+        tell_restart(p, block)
         if not p.observation.placed and p.stillness.quiet_s >= READY_S and self._is_elsewhere():
             return Outcome.NEXT_STEP
         if not self.was_moved and any(reason.key == "turn_differs" for reason in p.last_try):
@@ -98,6 +99,7 @@ class Resting(PhaseState):
         self._waiting: list[Array] = []
         self._sums: list[Array] = []
         self._means: list[Array] = []
+        self._degc: list[list[float]] = []
         self._first = -1
         self._count = 0
 
@@ -127,6 +129,8 @@ class Resting(PhaseState):
         sums, means = binned(rows[:whole], self._samples)
         self._sums.append(sums)
         self._means.append(means)
+        if known := [degc for degc in self.progress.status.temperature_degc.values() if degc is not None]:
+            self._degc.append(known)
 
     def _judge(self) -> Outcome:
         """Accept the rest, or reject it where it was none, or not in its pose."""
@@ -134,7 +138,8 @@ class Resting(PhaseState):
         bin_s = self._samples * p.interval_s
         sums, means = np.concatenate(self._sums), np.concatenate(self._means)
         degc = np.full(4, np.nan)
-        rest = RestBins(0, self._first, p.counter + 1, 0.0, bin_s, self._samples, sums, means, degc)
+        span_k = max((max(of_one) - min(of_one) for of_one in zip(*self._degc, strict=False)), default=0.0)
+        rest = RestBins(0, self._first, p.counter + 1, 0.0, bin_s, self._samples, sums, means, degc, span_k)
         known = coefficients(p.calibration)
         pulse = 1.0 / float(known.accelerometer_scale.mean()) if known.accelerometer_in_pulses else 0.0
         if drift := rest.drift(rest_noise([rest.steady]), pulse):
@@ -167,6 +172,8 @@ class LongRest(PhaseState):
         if self._first < 0:
             self._first = int(block.rows["counter"][0])
         self._count += len(block.rows)
+        if block.restarted:  # its numbers begin anew
+            self._first, self._count = int(block.rows["counter"][0]), len(block.rows)
         if cause := p.disturbance(block):
             p.elapsed_s -= block.seconds
             if not self._is_disturbed:
@@ -206,8 +213,20 @@ def accept(p: Progress, first: int, samples: int, rest_s: float) -> None:
     p.bells += 1
 
 
+def tell_restart(p: Progress, block: Block) -> None:
+    """Tell the operator that the unit restarted between two rests; what is accepted remains."""
+    if block.restarted and p.accepted:
+        p.tell(message("restarted_on_the_way"))
+
+
 class RestVerdict(Verdict):
     """The verdict on a rest."""
+
+    def feed(self, block: Block) -> Outcome | None:
+        """Wait."""
+        outcome = super().feed(block)
+        tell_restart(self.progress, block)
+        return outcome
 
     def rejection(self) -> Prompt:
         """Return what to do after a rejection."""

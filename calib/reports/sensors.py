@@ -78,7 +78,7 @@ def _decimals(sigma: float) -> int:
 
 def _rests(result: SensorsResult) -> Iterator[Block]:
     evidence, adjustment = result.evidence, result.adjustment
-    several = len(result.inputs.captures) > 1
+    several = len(evidence.captures) > 1
     sigmas = {}
     if adjustment is not None:
         for block, sigma in zip(adjustment.system.blocks, worst_residuals(adjustment), strict=True):

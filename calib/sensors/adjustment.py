@@ -53,6 +53,8 @@ LARGER_WANDER: Final = 2.0
 AT_CEILING: Final = 0.999
 CHI_SQUARE_95: Final = 3.84
 """Wander at its ceiling is too large if twice as much explains the residuals significantly better."""
+LEAST_FREEDOM: Final = 4.0
+"""Fewest degrees of freedom of the wander that count: at most they double its variance."""
 CONVERGED: Final = 1e-4
 """Largest step of a parameter, in its sigma, at which the iteration ends."""
 
@@ -423,7 +425,11 @@ def _scale_and_axes(matrix: Array) -> tuple[Array, Array]:
 def _wander(
     system: LinearSystem, Z: Array, p: Parameters, site_gravity: float, gravity_sigma: float
 ) -> Wander:
-    """Return the size of the wander that the residuals show, below its ceiling (restricted likelihood)."""
+    """Return the size of the wander that the residuals show, below its ceiling (restricted likelihood).
+
+    Few residuals show it, so that its variance is uncertain, and errors over it are those of Student's t.
+    With n degrees of freedom their variance is larger by n / (n - 2): that is the size returned.
+    """
     ceilings = np.array([GYRO_WANDER_CEILING, ACCELEROMETER_WANDER_CEILING])
     J = system.J @ Z
     damping = np.zeros((len(Z), len(Z)))
@@ -457,7 +463,34 @@ def _wander(
         larger = shares.copy()
         larger[k] = LARGER_WANDER**2
         exceeds.append(bool(shares[k] > AT_CEILING and deviance(shares) - deviance(larger) > CHI_SQUARE_95))
+    freedom = _freedom_of_wander(system, J, prior)
+    shares = np.minimum(shares / (1.0 - 2.0 / np.maximum(freedom, LEAST_FREEDOM)), 1.0)
     return Wander(*(ceilings * np.sqrt(shares)).tolist(), *exceeds)
+
+
+def _freedom_of_wander(system: LinearSystem, J: Array, prior: Array) -> Array:
+    """Return the degrees of freedom of the wander: how many residuals show it (Satterthwaite).
+
+    Parameters
+    ----------
+    system : LinearSystem
+    J, prior : ndarray
+        Of what is free.
+
+    Returns
+    -------
+    ndarray, shape (2,)
+        Of gyros and accelerometers.
+    """
+    factor = cho_factor(system.V, lower=True)
+    weighted = cho_solve(factor, J)
+    P = _inverse(J.T @ weighted + prior)
+    freedom = np.zeros(2)
+    for k, by_variance in enumerate(system.wander):
+        shown = cho_solve(factor, by_variance) - weighted @ P @ (weighted.T @ by_variance)
+        squares = np.trace(shown @ shown)
+        freedom[k] = np.trace(shown) ** 2 / squares if squares > 0.0 else 0.0
+    return freedom
 
 
 def _result(

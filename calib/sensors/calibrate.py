@@ -11,6 +11,7 @@ from typing import Final, Literal
 
 import numpy as np
 
+from calib.detection.sections import split_at_restarts
 from calib.inputs import StrPath, profile_of, require_six_axes, site_of
 from calib.messages import english
 from calib.procedure.planned_turn import turn_fault
@@ -117,7 +118,8 @@ def calibrate_sensors(
     Parameters
     ----------
     captures : sequence of path-like
-        Wire bytes, CAN logs or recordings; each is a session of its own.
+        Wire bytes, CAN logs or recordings; each is a session of its own, and each part between restarts of
+        the unit.
     site : path-like or Site
         Place of the unit.
     unit : str
@@ -198,9 +200,12 @@ def calibrate_sensors(
 
 
 def _pulses(capture: Capture, advance: Callable[[int], None]) -> Iterator[Records]:
-    yield from capture.pulses(advance)
+    seen = 0
+    for section, piece in split_at_restarts(capture.pulses(advance), capture.layout.counter_step):
+        seen = section
+        yield piece
     restarts = capture.tracker.counts.restarts
-    if restarts:
+    if restarts > seen:  # it does not show in the numbers of the samples
         raise InputError(
             f"{capture.path}: expected a unit that stays powered, got {restarts} restarts; divide the "
             "capture there, each part is a session of its own"

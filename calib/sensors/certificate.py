@@ -296,7 +296,7 @@ def result_document(result: SensorsResult) -> dict[str, Any]:
         "missing": list(result.missing),
         "left_out": [
             {
-                "capture": result.inputs.captures[one.session].name,
+                "capture": result.inputs.captures[evidence.captures[one.session]].name,
                 "what": one.what,
                 "start_s": round(one.start_s, 3),
                 "stop_s": round(one.stop_s, 3),

@@ -81,6 +81,8 @@ class Evidence:
         For the rate of the size effect: without the dither that the increments of the gyros carry.
     dither : tuple of DitherLine
         Its lines in the first rest.
+    captures : tuple of int
+        Number of the capture of each session: a restart of the unit begins another session.
     """
 
     rests: tuple[RestBins, ...]
@@ -91,6 +93,7 @@ class Evidence:
     fastest: float = 0.0
     rate_filter: RateFilter = STEADY
     dither: tuple[DitherLine, ...] = ()
+    captures: tuple[int, ...] = (0,)
 
     @property
     def is_dithered(self) -> bool:

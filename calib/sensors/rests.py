@@ -5,14 +5,17 @@ Three passes over the pulses: where the unit rests; the rests, in bins of a seco
 
 from collections.abc import Callable, Iterable, Iterator, Sequence, Set
 from dataclasses import dataclass
-from itertools import pairwise
+from functools import partial
+from itertools import groupby, pairwise
 from math import sqrt
+from operator import itemgetter
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib.detection.rest_bins import BIN_S, LEAST_RESTS, Noise, RestBins, binned, rest_noise
+from calib.detection.sections import split_at_restarts
 from calib.detection.segments import Segmenter
 from calib.estimation.dither_line import dither_lines
 from calib.messages import english
@@ -70,11 +73,26 @@ def read_evidence(
     found: list[RestBins] = []
     left: list[Left] = []
     cuts: set[tuple[int, int]] = set()  # where a long rest was divided
-    for session, pulses in enumerate(captures):
-        windows, short = _windows(session, pulses(), layout, nominal)
-        guards = 2 * round(GUARD_S / samples_s(layout))
-        cuts |= {(session, b.start) for a, b in pairwise(windows) if b.start - a.stop == guards}
-        left += short
+    sessions: list[Callable[[], Iterable[Records]]] = []
+    origins: list[int] = []
+    windows_of: list[list[_Window]] = []
+    for number, pulses in enumerate(captures):
+        begin_s, step = 0.0, layout.counter_step
+        for section, parts in groupby(split_at_restarts(pulses(), step), key=itemgetter(0)):
+            session = len(sessions)
+            if section:
+                reason = "the unit restarted: attitude and velocity are not carried over it"
+                left.append(Left(session, begin_s, begin_s, "motion", reason))
+            whole = (part for _, part in parts)
+            windows, short, length_s = _windows(session, whole, begin_s, layout, nominal)
+            begin_s += length_s
+            guards = 2 * round(GUARD_S / samples_s(layout))
+            cuts |= {(session, b.start) for a, b in pairwise(windows) if b.start - a.stop == guards}
+            left += short
+            sessions.append(partial(_section, pulses, section, step))
+            origins.append(number)
+            windows_of.append(windows)
+    for session, (pulses, windows) in enumerate(zip(sessions, windows_of, strict=True)):
         rests, dropped = _bins(session, pulses(), windows, layout, nominal)
         found += rests
         left += dropped
@@ -93,7 +111,7 @@ def read_evidence(
     noise = rest_noise(still)
     links: list[Link] = []
     fastest = 0.0
-    for session, pulses in enumerate(captures):
+    for session, pulses in enumerate(sessions):
         numbers = [k for k, rest in enumerate(still) if rest.session == session]
         for item in _links(pulses(), [(k, still[k]) for k in numbers], layout, nominal):
             if isinstance(item, Link):
@@ -105,7 +123,16 @@ def read_evidence(
     ordered = tuple(sorted(left, key=lambda one: (one.session, one.start_s)))
     rates = _rate_filter(still, noise, quanta[0], layout)
     dither = dither_lines(still[0].beginning, samples_s(layout))
-    return Evidence(tuple(still), tuple(links), ordered, noise, quanta, fastest, rates, dither)
+    return Evidence(
+        tuple(still), tuple(links), ordered, noise, quanta, fastest, rates, dither, tuple(origins)
+    )
+
+
+def _section(pulses: Callable[[], Iterable[Records]], number: int, counter_step: int) -> Iterator[Records]:
+    """Yield the pulses of a capture between two restarts of the unit."""
+    for section, part in split_at_restarts(pulses(), counter_step):
+        if section == number:
+            yield part
 
 
 KNOCK_S: Final = 10.0
@@ -159,15 +186,18 @@ class _Window:
 
 
 def _windows(
-    session: int, pulses: Iterable[Records], layout: Layout, nominal: NominalScales
-) -> tuple[list[_Window], list[Left]]:
-    """Find the rests, without a guard at both ends."""
+    session: int, pulses: Iterable[Records], begin_s: float, layout: Layout, nominal: NominalScales
+) -> tuple[list[_Window], list[Left], float]:
+    """Find the rests, without a guard at both ends, from a time of the capture on; also return the length."""
     compensator = Compensator(_coefficients(nominal), layout)
-    segmenter = Segmenter()
+    segmenter = Segmenter(begin_s)
     for piece in pulses:
         segmenter.feed(compensator.feed(piece))
     segmenter.feed(compensator.close())
-    segments = segmenter.result()
+    try:
+        segments = segmenter.result()
+    except InputError:  # too short for a rest
+        return [], [], 0.0
     windows, left = [], []
     guard = round(GUARD_S / segments.interval_s)
     for rest in segments.rests:
@@ -177,7 +207,7 @@ def _windows(
         else:
             at_s = rest.start_s + guard * segments.interval_s
             windows.append(_Window(rest.start + guard, rest.stop - guard, at_s))
-    return windows, left
+    return windows, left, segments.duration_s
 
 
 def _coefficients(nominal: NominalScales) -> Coefficients:

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from calib.bench.result import decode_covered, uncovered
+from calib.bench.entries import AcceptedRest
+from calib.bench.result import decode_covered, uncovered, uncovered_rests
 from calib.bench.state import Attempt
 from calib.procedure.schema import Run
 from imudrv import profiles
@@ -89,9 +90,24 @@ def test_samples_before_a_restart_of_the_unit_are_not_used(recorded: Recorded, t
     assert uncovered(attempt(late)) == "its recording does not cover counters 2000..2099"
 
 
+def rest(name: str, first: int, last: int, recording: Path) -> AcceptedRest:
+    span = {"first_counter": first, "last_counter": last, "samples": last - first + 1}
+    where = {"rest_s": 1.0, "lean_deg": 0.0, "heading_deg": None, "recording": recording.name}
+    return AcceptedRest(name, 1, **span, **where)
+
+
+def test_rests_are_covered_on_both_sides_of_a_restart(recorded: Recorded, tmp_path: Path) -> None:
+    path = recorded(tmp_path / "run-1.mcap", [*range(1000, 5500), *range(4000)])
+    before, after = rest("z", 2000, 4999, path), rest("x", 100, 3900, path)
+    across = rest("y", 500, 4500, path)  # no part between restarts has it whole
+
+    assert list(uncovered_rests(path, [before, across, after])) == ["y"]
+
+
 def test_a_recording_without_samples_covers_nothing(recorded: Recorded, tmp_path: Path) -> None:
     path = recorded(tmp_path / "run.mcap", [])
     assert uncovered(attempt(path)) == "its recording does not cover counters 2000..4999"
+    assert list(uncovered_rests(path, [rest("z", 2000, 4999, path)])) == ["z"]
     path.write_bytes(b"something else")
     with pytest.raises(InputError, match=r"run.mcap: expected a recording"):
         uncovered(attempt(path))

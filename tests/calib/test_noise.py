@@ -153,6 +153,14 @@ def test_what_is_not_in_the_data_is_not_observable_and_has_a_limit() -> None:
         assert (found.below[[B, K, R]] > 0.0).all()
 
 
+def test_a_coefficient_is_above_its_95_percent_limit_in_5_percent_of_the_records() -> None:
+    rng, tau, rate_walk = np.random.default_rng(8), 0.05, 1e-7  # hardly observable in a record
+    fits = [fitted(noisy(rng, 20_000, tau, 2e-6, 1e-6, rate_walk), tau) for _ in range(60)]
+    above = sum(f.below[K] < rate_walk for f in fits)
+    assert above <= 8  # 3 +- 1.7; three sigma
+    assert np.median([f.below[K] for f in fits]) < 2.0 * rate_walk
+
+
 def test_a_rate_walk_is_not_taken_for_a_bias_instability() -> None:
     rng, tau = np.random.default_rng(6), 0.05
     found = fitted(noisy(rng, 288_000, tau, 2e-6, 3e-7, 3e-8), tau)

@@ -9,6 +9,7 @@ import pytest
 from calib.messages import english
 from calib.procedure.engine import Engine
 from calib.procedure.events import (
+    Conditions,
     Confirm,
     Entered,
     Event,
@@ -141,6 +142,21 @@ def test_a_rest_on_a_plate_that_sinks_is_asked_for_again(site: Site, bench: Benc
     assert "arcsec" in drive.why[0]
 
 
+@pytest.mark.parametrize(("axis", "kelvin", "accepted"), [(2, 0.5, True), (2, 0.0, False), (0, 0.5, False)])
+def test_a_force_along_gravity_that_changes_with_the_temperature_is_no_tilt(
+    site: Site, bench: Bench, step: Any, axis: int, kelvin: float, accepted: bool
+) -> None:
+    samples = bench(step(CHECK_S + REST_S))
+    warm = np.clip((np.arange(len(samples)) * INTERVAL_NS * 1e-9 - CHECK_S) / REST_S, 0.0, 1.0)
+    samples["dv_b"][:, axis] += warm * 90.0 * UG * INTERVAL_NS * 1e-9
+    drive = Driver(site, plan(Z))
+    for at in range(0, len(samples), 500):  # once a second
+        drive.engine.update_status(Conditions((), {"gyro": 30.0 + kelvin * float(warm[at])}))
+        drive.feed(samples[at : at + 500])
+
+    assert drive.accepted == (["z"] if accepted else [])
+
+
 def test_a_wrong_side_is_named_and_another_pose_of_the_plan_counts(
     site: Site, bench: Bench, step: Any
 ) -> None:
@@ -165,9 +181,44 @@ def test_samples_lost_on_the_way_are_named_and_the_rest_is_accepted(site: Site, 
 
     assert drive.accepted == ["z", "z-turned"]
     assert [event.missing for event in drive.of(RestAccepted)] == [0, 100]
-    assert "100 samples lost on the way here" in " ".join(
-        english(reason) for view in drive.views for reason in view.reasons
-    )
+    assert "100 samples lost on the way here" in " ".join(told(drive))
+
+
+def restarted(samples: Records, at_s: float) -> Records:
+    """Samples of a unit that was switched off for a tenth of a second and numbers them from 0 again."""
+    at = round(at_s / (INTERVAL_NS * 1e-9))
+    after = samples[at + 50 :].copy()
+    after["counter"] -= after["counter"][0]
+    return np.concatenate([samples[:at], after])
+
+
+def told(drive: Driver) -> set[str]:
+    return {english(reason) for view in drive.views for reason in view.reasons}
+
+
+def test_a_restart_on_the_way_is_told_at_once_and_the_rests_remain(site: Site, turned: Records) -> None:
+    at_s = CHECK_S + REST_S + 1.5
+    samples = restarted(turned, at_s)
+    drive = Driver(site, plan(Z))
+    drive.feed(samples[: round((at_s + 0.2) / (INTERVAL_NS * 1e-9))])
+
+    assert drive.accepted == ["z"]
+    assert [english(reason) for reason in drive.engine.view.reasons] == [
+        "the unit restarted: the motion from the last rest is not used, the accepted rests are; "
+        "keep the unit powered"
+    ]
+    assert Driver(site, plan(Z)).feed(samples).accepted == ["z", "z-turned"]
+
+
+def test_a_restart_in_a_rest_is_the_end_of_it_and_it_is_asked_for_again(
+    site: Site, bench: Bench, step: Any
+) -> None:
+    samples = restarted(bench(step(CHECK_S + 3.0 * REST_S)), CHECK_S + 0.5 * REST_S)
+    drive = Driver(site, plan(Z)).feed(samples)
+
+    assert len(drive.why) == 1
+    assert drive.why[0].endswith(": the unit restarted")
+    assert drive.accepted == ["z"]
 
 
 def test_with_keys_each_rest_is_confirmed(site: Site, turned: Records) -> None:
@@ -247,9 +298,24 @@ def test_a_long_rest_goes_on_after_a_disturbance_and_after_a_kill(
     assert drive.accepted == ["z"]
     assert drive.why == []
     assert [round(event.rest_s) for event in drive.of(Rested)] == [60, 120]
-    told = {english(reason) for view in drive.views for reason in view.reasons}
-    assert any(reason.startswith("disturbed after 7") for reason in told)
+    assert any(reason.startswith("disturbed after 7") for reason in told(drive))
 
     again = Driver(site, plan(one, kind="noise", rest_s=130.0), rested_s={"z": 120.0})
     again.feed(samples[: round((CHECK_S + 14.0) / (INTERVAL_NS * 1e-9))])
     assert again.accepted == ["z"]
+
+
+def test_a_long_rest_over_a_restart_is_that_of_the_samples_numbered_since(
+    site: Site, bench: Bench, step: Any
+) -> None:
+    one = {"id": "z", "up": "+Z", "east": "+X"}
+    samples = restarted(bench(step(CHECK_S + 82.0)), CHECK_S + 40.0)
+    drive = Driver(site, plan(one, kind="noise", rest_s=70.0)).feed(samples)
+
+    (accepted,) = drive.of(RestAccepted)
+    assert any(
+        reason.endswith("the unit restarted; the time at rest goes on, a longer stretch shows more")
+        for reason in told(drive)
+    )
+    assert accepted.last_counter - accepted.first_counter + 1 == accepted.samples
+    assert 25.0 < accepted.samples * INTERVAL_NS * 1e-9 < 35.0

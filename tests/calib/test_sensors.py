@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from calib.detection.rest_bins import Noise
 from calib.estimation.dither_line import DitherLine
 from calib.procedure.plan import load as load_procedure
 from calib.procedure.schema import Procedure
-from calib.sensors.adjustment import Free
+from calib.sensors.adjustment import Free, Wander, _wander, _whole_basis, covariance_of
 from calib.sensors.calibrate import SensorsOptions, calibrate_sensors, named_poses
 from calib.sensors.calibrate import solve as solve_evidence
 from calib.sensors.certificate import certificate, result_document
@@ -32,7 +33,7 @@ from imudrv.nav.attitude import rotation
 from imudrv.records import Flag, Records
 from imudrv.sensor_calibration import number_paths
 from imudrv.site import Site
-from imudrv.units import ARCSEC
+from imudrv.units import ARCSEC, UG
 from imudrv.wire.encode import StreamEncoder
 from tools.psins_to_wire import FLOAT_PROFILE, convert
 from tools.sensors_accuracy import errors, golden_truth
@@ -353,6 +354,16 @@ def rest_starts(session: Records) -> list[int]:
         at = ends[0] * 10 + int(0.8 * REST_S * RATE)
 
 
+def test_a_wander_that_few_residuals_show_counts_for_more_than_its_likely_size(result):
+    found, rng = result.adjustment, np.random.default_rng(3)
+    Z = _whole_basis(Free(), len(found.attitudes))
+    root = np.linalg.cholesky(covariance_of(found.system, Wander(0.0, 5.0 * UG)))
+    draws = (replace(found.system, residual=root @ rng.standard_normal(len(root))) for _ in range(60))
+    sizes = [_wander(one, Z, found.p, found.p.gravity, 1e-5).accelerometer / UG for one in draws]
+    # 8 degrees of freedom: 5 ug sqrt(8 / 6) = 5.8, known to 4 % from 60 draws
+    assert 5.1 < np.sqrt(np.mean(np.square(sizes))) < 6.5
+
+
 # Rests that are none, and losses
 
 
@@ -507,6 +518,31 @@ def test_frames_lost_while_carried_cost_that_motion(solve, session, result):
         for r in (result, found)
     ]
     assert scales[1] > scales[0]
+
+
+def test_a_restart_of_the_unit_costs_the_motion_and_is_named(solve, session, result):
+    at = rest_starts(session)[6] - 150  # while it is carried to the seventh rest
+    after = session[at + 100 :].copy()
+    after["counter"] -= after["counter"][0]  # as of a unit that was switched on again
+    found = solve(np.concatenate([session[:at], after]))
+
+    assert len(found.evidence.rests) == 12
+    assert [(link.before, link.after) for link in found.evidence.links] == [
+        (k, k + 1) for k in range(11) if k != 5
+    ]
+    (left,) = found.evidence.left
+    assert left.reason == "the unit restarted: attitude and velocity are not carried over it"
+    assert left.start_s == pytest.approx(at / RATE, abs=0.1)
+    assert found.evidence.captures == (0, 0)
+    document = result_document(found)
+    assert document["left_out"][0]["capture"] == "session-0.raw"
+    assert len(document["sensors"]["captures"]) == 1
+    change = [
+        abs(a.value - b.value) / b.sigma
+        for a, b in zip(result.estimates, found.estimates, strict=True)
+        if a.is_shown
+    ]
+    assert max(change) < 2.0  # the same rests, but for one motion
 
 
 def test_frames_lost_at_rest_leave_its_longer_part(solve, session):
