@@ -1,8 +1,8 @@
 """Dither line of each gyro in the angle increments at rest.
 
 The spectrum of the increments is the mean over windows of a second. A line stands out of the median
-of the spectrum above `LOWEST_HZ`. Increments of an angle a sin(2 pi f t) have the amplitude
-2 a sin(pi f tau).
+of the spectrum above `LOWEST_HZ`, or above `LEAST_HZ` at a sample rate that aliases dither into the motion.
+Increments of an angle a sin(2 pi f t) have the amplitude 2 a sin(pi f tau).
 """
 
 from math import pi, sin
@@ -11,12 +11,16 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from imudrv.arrays import Array
+from imudrv.imu.rate_filter import DITHER_BAND_HZ, DITHER_HZ
 
 WINDOW_S: Final = 1.0
 """Length of a window, s: lines 1 Hz apart are separate."""
 
 LOWEST_HZ: Final = 50.0
 """Lowest frequency of a line: below it are the movements of a bench."""
+
+LEAST_HZ: Final = 3.0
+"""Lowest frequency of a line that may be aliased dither; no rate filter separates it from the motion."""
 
 LEAST_RATIO: Final = 20.0
 """Power of a line over the median; noise reaches 10 in 500 frequencies and a few windows."""
@@ -51,7 +55,9 @@ def dither_lines(dtheta_b: Array, interval_s: float) -> tuple[DitherLine, ...]:
     size = round(WINDOW_S / interval_s)
     count = len(dtheta_b) // size
     frequency_hz = np.fft.rfftfreq(size, interval_s)
-    wanted = frequency_hz >= LOWEST_HZ
+    sample_hz = 1.0 / interval_s
+    aliased_hz = abs(DITHER_HZ - sample_hz * round(DITHER_HZ / sample_hz)) - DITHER_BAND_HZ
+    wanted = frequency_hz >= (LOWEST_HZ if aliased_hz > LOWEST_HZ else LEAST_HZ)
     if not count or not wanted.any():
         return ()
     windows = dtheta_b[: count * size].reshape(count, size, 3)

@@ -1,12 +1,14 @@
-"""Low-pass filter of the angle increments: dither goes, motion stays, and no cut of the data shows."""
+"""Dither in the angle increments is filtered out and named; motion stays, and no cut of the data shows."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from calib.estimation.dither_line import dither_lines
 from calib.estimation.low_pass import without_dither
 from imudrv.records import INCREMENTS, Records
+from imudrv.units import ARCSEC
 
 HALF = 8
 """Rows at each end whose neighbours are not all there."""
@@ -74,3 +76,29 @@ def test_at_a_rate_that_aliases_the_dither_nothing_changes() -> None:
 def test_a_capture_shorter_than_the_filter_gives_no_rows() -> None:
     assert list(without_dither([capture(np.ones(2 * HALF))])) == []
     assert list(without_dither([])) == []
+
+
+@pytest.mark.parametrize(
+    ("interval_ms", "shown_hz"),
+    [
+        pytest.param(1.0, 392.0, id="1 kHz"),
+        pytest.param(2.5, 8.0, id="400 Hz"),
+        pytest.param(5.0, 8.0, id="200 Hz"),
+    ],
+)
+def test_dither_is_named_at_a_sample_rate_that_aliases_it_into_the_motion(
+    interval_ms: float, shown_hz: float
+) -> None:
+    t = interval_ms * 1e-3 * np.arange(round(20e3 / interval_ms) + 1)
+    angle = 1e-8 * np.random.default_rng(1).standard_normal((len(t), 3))
+    angle[:, 1] += 10.0 * ARCSEC * np.sin(2.0 * np.pi * 392.0 * t)
+    (line,) = dither_lines(np.diff(angle, axis=0), interval_ms * 1e-3)
+    assert (line.axis, line.frequency_hz) == ("Y", pytest.approx(shown_hz, abs=0.5))
+    assert line.amplitude_rad == pytest.approx(10.0 * ARCSEC, rel=0.05)  # windows of a second
+
+
+def test_what_sways_a_bench_is_not_taken_for_dither() -> None:
+    t = 1e-3 * np.arange(20_001)
+    angle = 1e-8 * np.random.default_rng(1).standard_normal((len(t), 3))
+    angle[:, 1] += 10.0 * ARCSEC * np.sin(2.0 * np.pi * 8.0 * t)
+    assert dither_lines(np.diff(angle, axis=0), 1e-3) == ()
