@@ -91,7 +91,7 @@ def ask_operator(
 
 def summarise(result: SessionResult, screen: OperatorScreen) -> None:
     """Print what the operator needs for the decision."""
-    screen.print(result.text)
+    screen.print(result.text(screen.language))
     for mark, why in result.verdicts:
         screen.say(message("mark", mark=MARK_NAMES[mark], text=why))
 

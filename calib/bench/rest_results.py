@@ -40,9 +40,8 @@ class RestsResult(NamedTuple):
     def _numbers(self) -> Section | None:
         return next((section for section in self.document.sections if section.title == self.title), None)
 
-    @property
-    def text(self) -> str:
-        """The numbers as text."""
+    def text(self, language: str) -> str:
+        """Return the numbers as text; it is English in every language."""
         return blocks_text(self._numbers.blocks) if self._numbers else ""
 
     @property
