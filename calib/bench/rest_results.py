@@ -49,7 +49,8 @@ class RestsResult(NamedTuple):
         """The numbers as a table for the page."""
         blocks = self._numbers.blocks if self._numbers else ()
         tables = [block for block in blocks if isinstance(block, Table)]
-        return {"table": [list(row) for table in tables for row in (table.head, *table.rows)]}
+        rows = [[[table.title], table.head, *table.rows] for table in tables]
+        return {"table": [list(row) for of_table in rows for row in of_table if row != [""]]}
 
 
 def calibrate_session(session: SessionState) -> RestsResult:
