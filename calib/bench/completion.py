@@ -91,7 +91,7 @@ def ask_operator(
 
 def summarise(result: SessionResult, screen: OperatorScreen) -> None:
     """Print what the operator needs for the decision."""
-    screen.print(result.text)
+    screen.print(result.text(screen.language))
     for mark, why in result.verdicts:
         screen.say(message("mark", mark=MARK_NAMES[mark], text=why))
 
@@ -126,10 +126,10 @@ def accepted_result(session: Session) -> tuple[Message, ...]:
     decision = session.stage(Decision)
     if decision is None or not decision.accepted:
         return ()
-    return (
-        message("active_certificate", path=str(session.plan.certificate.path)),
-        message("report_written", folder=str(session.folder)),
-    )
+    report = message("report", path=str(session.folder / REPORTS["en"]))
+    if session.procedure().kind == "arms":  # in each language
+        report = message("report_written", folder=str(session.folder))
+    return message("active_certificate", path=str(session.plan.certificate.path)), report
 
 
 def write_report(session: Session, result: SessionResult, verified: Message | None = None) -> None:

@@ -20,9 +20,8 @@ class SessionResult(Protocol):
     def verdicts(self) -> tuple[tuple[str, Message], ...]:
         """Marks and reasons."""
 
-    @property
-    def text(self) -> str:
-        """What the operator needs for the decision."""
+    def text(self, language: str) -> str:
+        """Return what the operator needs for the decision."""
 
     @property
     def page(self) -> dict[str, Any]:

@@ -40,9 +40,8 @@ class RestsResult(NamedTuple):
     def _numbers(self) -> Section | None:
         return next((section for section in self.document.sections if section.title == self.title), None)
 
-    @property
-    def text(self) -> str:
-        """The numbers as text."""
+    def text(self, language: str) -> str:
+        """Return the numbers as text; it is English in every language."""
         return blocks_text(self._numbers.blocks) if self._numbers else ""
 
     @property
@@ -50,7 +49,8 @@ class RestsResult(NamedTuple):
         """The numbers as a table for the page."""
         blocks = self._numbers.blocks if self._numbers else ()
         tables = [block for block in blocks if isinstance(block, Table)]
-        return {"table": [list(row) for table in tables for row in (table.head, *table.rows)]}
+        rows = [[[table.title], table.head, *table.rows] for table in tables]
+        return {"table": [list(row) for of_table in rows for row in of_table if row != [""]]}
 
 
 def calibrate_session(session: SessionState) -> RestsResult:

@@ -5,6 +5,7 @@ attempt.
 """
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -26,7 +27,7 @@ from calib.identification import (
     PriorCalibration,
     temperature_ranges,
 )
-from calib.messages import Message, english
+from calib.messages import Message, english, text
 from calib.procedure.plan import verification
 from calib.procedure.schema import VERIFICATION, Procedure
 from calib.reports.identification import arms_text
@@ -72,10 +73,9 @@ class Result(NamedTuple):
         """Marks and reasons."""
         return tuple(verdict(self.identification))
 
-    @property
-    def text(self) -> str:
-        """What the operator needs for the decision."""
-        return arms_text(self.identification.arms)
+    def text(self, language: str) -> str:
+        """Return what the operator needs for the decision."""
+        return arms_text(self.identification.arms, partial(text, language=language))
 
     @property
     def page(self) -> dict[str, Any]:

@@ -112,7 +112,7 @@ _STYLES: Final = {
 
 
 def with_port_state(view: View, state: LineState) -> View:
-    """Add a fault of the line to a view, and make it the headline.
+    """Add a fault of the line to a view, and make it the headline; what is over does not need the line.
 
     Parameters
     ----------
@@ -124,9 +124,9 @@ def with_port_state(view: View, state: LineState) -> View:
     Returns
     -------
     View
-        The same view if there is no fault.
+        The same view if there is no fault, or after the last step.
     """
-    if not state.trouble:
+    if not state.trouble or view.phase in (Phase.DONE, Phase.ABORTED):
         return view
     headlines = {"unreadable": NO_FRAMES, "wrong rate": WRONG_RATE}
     headline = headlines.get(state.name, NO_DATA)
@@ -193,8 +193,8 @@ def plain(view: View, question: Message | None = None, language: str = "en") -> 
     def shown(what: Message) -> str:
         return text(what, language)
 
-    phase = f"{shown(PHASES[view.phase])}: {shown(view.headline)}"
-    parts = [shown(view.title), phase, *map(shown, view.hints)]
+    phase = message("mark", mark=PHASES[view.phase], text=view.headline)
+    parts = [shown(view.title), shown(phase), *map(shown, view.hints)]
     parts += [f"! {shown(why)}" for why in shown_reasons(view)] + [
         shown(tried) for tried in shown_last_try(view)
     ]
@@ -217,6 +217,8 @@ class OperatorScreen:
 
     Attributes
     ----------
+    language : str
+        Language that is shown.
     shown : View or None
         Newest view that has been written: the operator's keys refer to it.
     """
@@ -224,7 +226,7 @@ class OperatorScreen:
     def __init__(self, console: Console, language: str = "en") -> None:
         self.shown: View | None = None
         self._console = console
-        self._language = "en" if console.options.ascii_only else language
+        self.language = "en" if console.options.ascii_only else language
         self._is_plain = not console.is_terminal or console.is_dumb_terminal
         self._live: Live | None = None
         self._bells = 0
@@ -254,7 +256,7 @@ class OperatorScreen:
         OSError
             The terminal can no longer be written to.
         """
-        line = plain(view, question, self._language) if self._is_plain else ""
+        line = plain(view, question, self.language) if self._is_plain else ""
         if self._newest_view is not None and line == self._newest_line:
             self._newest_view.cancel()
         self._newest_line = line
@@ -266,7 +268,7 @@ class OperatorScreen:
 
     def say(self, what: Message) -> None:
         """Print a message as permanent text."""
-        self.print(text(what, self._language))
+        self.print(text(what, self.language))
 
     def close(self) -> None:
         """Write everything that waits, however long the terminal takes, and restore the terminal."""
@@ -284,7 +286,7 @@ class OperatorScreen:
 
     def _draw(self, view: View, question: Message | None) -> None:
         if self._is_plain:
-            self._print_line(plain(view, question, self._language))
+            self._print_line(plain(view, question, self.language))
         else:
             if view.bells > self._bells:
                 self._console.bell()
@@ -294,7 +296,7 @@ class OperatorScreen:
                 self._live.start()
             size = self._console.size
             ascii_only = self._console.options.ascii_only
-            drawn = screen(view, size.width, size.height, question, ascii_only, self._language)
+            drawn = screen(view, size.width, size.height, question, ascii_only, self.language)
             self._live.update(drawn, refresh=True)
         self.shown = view
 

@@ -128,6 +128,14 @@ class SessionState:
         return files
 
     @property
+    def reports(self) -> dict[str, str] | None:
+        """Name of the report for each language, the English one where there is no other; None: no report."""
+        files = self.files
+        if REPORT not in files:
+            return None
+        return {language: name if name in files else REPORT for language, name in REPORTS.items()}
+
+    @property
     def accepted(self) -> dict[str, AcceptedStep | AcceptedRest]:
         """Accepted steps by their id."""
         accepted: dict[str, AcceptedStep | AcceptedRest] = {}

@@ -78,7 +78,6 @@ class WebConsole:
                 "steps": steps,
                 "language": language,
                 "labels": {name: _labels(name) for name in LANGUAGES},
-                "reports": REPORTS,
                 "questions": {name: _texts(question) for name, question in QUESTIONS.items()},
             },
         )
@@ -121,8 +120,7 @@ class WebConsole:
 
     def end(self, outcome: Sequence[Message]) -> None:
         """Show how the session has ended."""
-        is_reported = set(REPORTS.values()) <= self._session.files.keys()
-        self._keep("end", {"lines": [_texts(line) for line in outcome], "report": is_reported})
+        self._keep("end", {"lines": [_texts(line) for line in outcome], "reports": self._session.reports})
 
     def close(self) -> None:
         """End the server."""

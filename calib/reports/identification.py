@@ -99,9 +99,9 @@ def report_html(identification: IdentificationResult, arms: Sequence[LeverArms])
     return as_html(document(identification, arms))
 
 
-def arms_text(arms: LeverArms) -> str:
+def arms_text(arms: LeverArms, say: Say = english) -> str:
     """Return lever arms alone, with their gauge, as plain text."""
-    return blocks_text([_arms_table(arms)])
+    return blocks_text([_arms_table(arms, say)])
 
 
 def result_blocks(

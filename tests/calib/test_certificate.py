@@ -30,6 +30,7 @@ from calib.estimation.result import (
 )
 from calib.identification import IdentificationResult, PriorCalibration
 from calib.lever_arms.gauge import convert
+from calib.messages import verbatim
 from calib.result_file import result_document, write_json
 from imudrv.calibration import Calibration, read_calibration, write_calibration
 from imudrv.errors import InputError
@@ -61,7 +62,7 @@ def identification(**changes: object) -> IdentificationResult:
         rank=6,
         direction_sigma=np.array([1e-5, 1.1e-5, 1.2e-5, 1.8e-5, 1.9e-5, 2e-5, 1.0, 1.0, 1.0]),
         singular_values=np.array([8.0, 8.0, 8.0, 4.7, 4.7, 4.7, 0.0, 0.0, 0.0]),
-        reason="rank 6",
+        reason=verbatim("rank 6"),
         scatter=ChiSquare(90.0, 100, 200),
         redundancy=ChiSquare(5.0, 6),
         dither_error=0.01,

@@ -407,8 +407,9 @@ def test_unobservable_parameters_are_noted(simulated: tuple[list[Run], Array]) -
     found = estimate_joint(simulated[0], extra=("quadratic",))
     # a quadratic term is a bias where one axis is always up
     assert len(found.notes) == 3
-    assert found.notes[0].startswith("quadratic_x not observable in these runs: sigma ")
-    assert found.notes[0].endswith(" ug/g^2")
+    note = english(found.notes[0])
+    assert note.startswith("quadratic_x is not observable in these runs: sigma ")
+    assert note.endswith(" ug/g^2.")
     # and unobservable parameters do no harm
     np.testing.assert_allclose(found.R_b, estimate_joint(simulated[0]).R_b, atol=1e-3 * MM)
     assert estimate_joint(simulated[0]).notes == ()

@@ -3,6 +3,7 @@
 import re
 from base64 import b64decode
 from dataclasses import replace
+from functools import partial
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from calib.estimation.result import ChiSquare, LeaveOneOut
 from calib.identification import IdentificationResult, PriorCalibration, identify
 from calib.lever_arms.gauge import LeverArms, convert
 from calib.messages import english
+from calib.messages import text as translated
 from calib.reports.identification import arms_text, document, report_html, terminal_document
 from calib.reports.text import as_text
 from calib.reports.verdict import verdict
@@ -168,6 +170,7 @@ def test_lever_arms_are_always_shown_with_their_gauge(
     assert heads == [f"  Sensing points in body axes, mm, gauge {gauge}" for gauge in ("centroid", "x")]
     assert len(re.findall(r"^  r_x  ", text, re.MULTILINE)) == 2
     assert "gauge x" in arms_text(arms[1])
+    assert "基准x" in arms_text(arms[1], partial(translated, language="zh_CN"))
     assert "gauge x" in arms_text(LeverArms(arms[1].r_b, None, "x"))
 
 

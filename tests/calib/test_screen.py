@@ -183,6 +183,11 @@ def test_what_is_wrong_with_the_line_is_shown_and_without_samples_it_is_the_head
     assert state.trouble in "\n".join(rows(shown))
 
 
+def test_a_session_that_is_over_does_not_ask_for_the_line() -> None:
+    done = view(phase=Phase.DONE, headline=message("all_done"))
+    assert with_port_state(done, LineState("lost", "the port is gone")) == done
+
+
 def test_the_countdown_is_in_the_large_text_while_one_waits() -> None:
     shown = replace(view(Phase.ALIGN, remaining_s=354.0), headline=message("hands_off"))
     assert large_text(shown) == "HANDS OFF 5:54"

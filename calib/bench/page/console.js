@@ -5,7 +5,7 @@ const token = new URLSearchParams(location.search).get("token") || "";
 const SIZE = [150, 200, 100];  // of the unit along X, Y, Z, px
 const KEPT = 1200;             // frames in the plots: 60 s at 20 Hz
 const TONES = { good: 880, bad: 196, ready: 660, turn: 523 };
-let hello = null, view = null, result = null, lines = [], acting = false, ended = false, asked = null, socket = null;
+let hello = null, view = null, result = null, reports = null, lines = [], acting = false, ended = false, asked = null, socket = null;
 let language = "en", sounds = true, audio = null, bells = null, wasReady = false, wasActing = false;
 const done = new Set();  // steps that were accepted; the verification is a procedure of its own
 const history = { rate: [], force: [], stillness: [] };
@@ -143,7 +143,7 @@ function drawText() {
   $("tried").textContent = lost || ended || !view ? "" : view.last_try.map(inLanguage).join("");
   $("big").classList.toggle("rejected", Boolean(rejected) && !lost);
   $("big").dataset.tone = lost ? "bad" : ended ? "good" : view ? view.tone : "wait";
-  $("report").href = `${hello.reports[language]}?token=${encodeURIComponent(token)}`;
+  if (reports) $("report").href = `${reports[language]}?token=${encodeURIComponent(token)}`;
   $("lines").textContent = lines.map(inLanguage).join("\n");
   if (asked) $("asked").textContent = inLanguage(hello.questions[asked.action]);
 }
@@ -177,7 +177,7 @@ function drawResult() {
   if (!result || !result.table) return;
   for (const row of result.table) {
     const line = element("tr", {}, $("arms"));
-    for (const cell of row) element(row[0] ? "td" : "th", {}, line).textContent = cell;
+    for (const cell of row) element(row[0] && row.length > 1 ? "td" : "th", {}, line).textContent = cell;
   }
   if (result.gauge) element("caption", {}, $("arms")).textContent = label("points").replace("{gauge}", result.gauge);
   for (const [mark, text] of result.verdicts) {
@@ -255,7 +255,8 @@ const taken = {
   end(content) {
     ended = true;
     lines = content.lines;
-    $("report").hidden = !content.report;
+    reports = content.reports;
+    $("report").hidden = !reports;
     draw();
     drawResult();
   },

@@ -51,6 +51,7 @@ function draw() {
   document.title = label("title");
   const lost = !socket || socket.readyState !== 1, gone = frame && frame.kind === "gone";
   $("health").dataset.health = lost || gone ? "fail" : frame ? frame.health : "warn";
+  $("main").classList.toggle("old", Boolean(lost || gone));
   if (lost) $("health").textContent = label("lost");
   else if (gone) $("health").textContent = `${label("no_service")}: ${frame.text}`;
   else if (frame)
