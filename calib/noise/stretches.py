@@ -1,9 +1,10 @@
 """Stretches of samples at rest without a gap, found while the samples come in.
 
 Samples are averaged over blocks of 0.1 s. A block is in motion if its mean rate differs from that of the last
-block at rest, or its mean specific force from that of the block before, by more than the unit's own noise
-allows; a second before and after a motion is left out, too. The noise is that of the quietest fifth of the
-first 20 s. A missing, saturated or faulty sample also ends a stretch.
+block at rest and from the mean of the last seconds at rest, or its mean specific force from that of the block
+before, by more than the unit's own noise allows; a second before and after a motion is left out, too. The
+noise is that of the quietest fifth of the first 20 s. A missing, saturated or faulty sample also ends a
+stretch.
 """
 
 from typing import Final, NamedTuple
@@ -31,6 +32,8 @@ LEAST_RATE: Final = 2.0 * EARTH_RATE
 """Smallest change of rate that is motion, rad/s: another attitude may change it by as much."""
 LEAST_FORCE: Final = 300.0 * UG
 """Smallest change of specific force that is motion, m/s^2."""
+FORGET: Final = 0.05
+"""Share of a block in the mean rate at rest: two seconds. The last block may be the beginning of a motion."""
 MOST_NAMED: Final = 50
 """Most disturbances that are named; the others are counted."""
 
@@ -88,7 +91,7 @@ class StretchSplitter:
         # Whether each block moves: those that are pending, and a guard before them.
         self._moving: NDArray[np.bool_] = np.zeros(self._guard, np.bool_)
         self._limits = np.zeros(0)
-        self._reference = np.zeros(6)
+        self._reference = np.zeros(9)
         self.disturbances: list[Disturbance] = []
         self.disturbed = 0
 
@@ -144,7 +147,8 @@ class StretchSplitter:
         changes = _norms(np.diff(means, axis=0)) if len(means) > 1 else np.zeros((1, 2))
         noise = np.maximum(np.quantile(changes, QUIET, axis=0), self._resolution)
         self._limits = np.array([LEAST_RATE, LEAST_FORCE]) + SIGMAS * noise
-        self._reference[:] = np.median(means, axis=0)
+        self._reference[:6] = np.median(means, axis=0)
+        self._reference[6:] = self._reference[:3]
 
     def _ready(self, blocks: int) -> tuple[Array, NDArray[np.int8]]:
         """Return the samples of the first pending blocks."""
@@ -195,14 +199,19 @@ def _norms(six: Array) -> Array:
 
 @kernel
 def _find_motion(means: Array, limits: Array, reference: Array, moving: NDArray[np.bool_]) -> None:
-    """Find the blocks in motion; `reference`: rate of the last block at rest, force of the last block."""
+    """Find the blocks in motion.
+
+    `reference`: rate of the last block at rest, force of the last block, mean rate at rest.
+    """
     for i in range(len(means)):
-        rate = force = 0.0
+        rate = mean_rate = force = 0.0
         for c in range(3):
             rate += (means[i, c] - reference[c]) ** 2
+            mean_rate += (means[i, c] - reference[c + 6]) ** 2
             force += (means[i, c + 3] - reference[c + 3]) ** 2
             reference[c + 3] = means[i, c + 3]
-        moving[i] = not (rate <= limits[0] ** 2 and force <= limits[1] ** 2)
+        moving[i] = not (min(rate, mean_rate) <= limits[0] ** 2 and force <= limits[1] ** 2)
         if not moving[i]:
             for c in range(3):
                 reference[c] = means[i, c]
+                reference[c + 6] += FORGET * (means[i, c] - reference[c + 6])

@@ -6,7 +6,7 @@ import numpy as np
 
 from calib.estimation.result import TO_DIFFERENCES
 from calib.lever_arms.gauge import LeverArms
-from calib.reports.document import Document, KeyValues, Section, Table
+from calib.reports.document import Block, Document, KeyValues, Paragraph, Section, Table
 from imudrv.calibration import Calibration
 from imudrv.units import MM
 
@@ -74,9 +74,12 @@ def calibration_comparison(found: Calibration, true: Calibration, name: str) -> 
             error = _number(found, path) - _number(true, path)
             largest = max(largest, abs(error) / u)
             rows.append((path, f"{error:.3g}", f"{u:.3g}", f"{abs(error) / u:.1f}"))
-    table = Table("Errors of the numbers that were estimated", ("", "error", "u", "error in u"), tuple(rows))
-    results = KeyValues((("largest error", f"{largest:.1f} u"),))
-    return Document("Against the truth", name, (Section("Error", (results, table) if rows else (results,)),))
+    blocks: tuple[Block, ...] = (Paragraph("Nothing to compare: the session estimated no calibration."),)
+    if rows:
+        head = ("", "error", "u", "error in u")
+        table = Table("Errors of the numbers that were estimated", head, tuple(rows))
+        blocks = KeyValues((("largest error", f"{largest:.1f} u"),)), table
+    return Document("Against the truth", name, (Section("Error", blocks),))
 
 
 def _number(calibration: Calibration, path: str) -> float:

@@ -217,6 +217,20 @@ def test_a_turn_ends_a_stretch_with_a_second_on_both_sides() -> None:
     assert np.count_nonzero(actions == SKIP) == 9000
 
 
+def test_the_rest_after_a_motion_that_begins_slowly_is_a_rest() -> None:
+    samples = pulses(40.0)
+    limit = split(samples, [])[2]._limits[0]  # noqa: SLF001
+    for block, times in ((250, 0.7), (251, 1.4), (252, 5.0)):
+        rows = slice(block * 100, (block + 1) * 100)
+        whole = np.floor(np.arange(1, 101) * times * limit * TAU / (0.5 * ARCSEC))
+        samples["gyro"][rows, 0] += np.diff(whole, prepend=0.0).astype(np.int64)
+    _, _, one = split(samples, [])
+
+    (motion,) = one.disturbances
+    assert motion.begin_s == pytest.approx(24.1, abs=0.11)
+    assert motion.end_s == pytest.approx(26.3, abs=0.11)
+
+
 def test_stretches_do_not_depend_on_how_the_samples_are_divided() -> None:
     samples = pulses(28.0, rate=0.01)
     samples["flags"][12_345] |= Flag.MISSING_BEFORE

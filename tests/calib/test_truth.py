@@ -2,7 +2,8 @@ import numpy as np
 
 from calib.lever_arms.gauge import LeverArms, convert
 from calib.reports.text import as_text
-from calib.reports.truth import comparison
+from calib.reports.truth import calibration_comparison, comparison
+from imudrv.sim.scenario import NOMINAL
 from imudrv.units import MM
 
 TRUE = LeverArms(np.array([[24.0, -11, -9], [-23, 29, -7], [-1, -18, 16]]) * MM, None, "centroid")
@@ -27,3 +28,10 @@ def test_errors_are_shown_beside_their_uncertainty() -> None:
     assert "r_x - r_z, error" in shown
     assert shown.count("0.0300") == 2
     assert shown.count("0.0141") == 6
+
+
+def test_a_session_of_the_noise_has_nothing_to_compare() -> None:
+    shown = as_text(calibration_comparison(NOMINAL, NOMINAL, "the simulated unit"))
+
+    assert "Nothing to compare: the session estimated no calibration." in shown
+    assert "largest error" not in shown
