@@ -188,14 +188,15 @@ def _inputs(identification: IdentificationResult, say: Say) -> Iterator[Block]:
         (message("report_pivot"), _PIVOTS[result.gauge]),
     )
     for source in identification.sources:
-        parts = [source.name, source.profile] + ([source.channel] if source.channel else [])
+        parts = [verbatim(source.name), verbatim(source.profile)]
+        parts += [message("report_channel", name=source.channel)] if source.channel else []
         warm = tuple(
             message("report_temperature", channel=channel.replace("_", " "), low_degc=low, high_degc=high)
             for channel, low, high in source.temperatures
         )
         yield _pairs(
             say,
-            (message("report_capture"), verbatim(", ".join(parts))),
+            (message("report_capture"), _listed(tuple(parts))),
             (message("report_sha256"), verbatim(source.sha256)),
             (message("report_contents"), _contents(source)),
             (message("temperature_of_unit"), _listed(warm) if warm else message("temperature_unknown")),

@@ -138,7 +138,7 @@ def test_every_number_of_a_new_unit_is_found_within_its_uncertainty(result, unit
     assert sigma["gyro.C_bg[1][0]"] < 0.4 * ARCSEC
     assert sigma["gyro.bias_deg_per_h[2]"] < 0.012
     assert sigma["accelerometer.scale_pulse_per_m_s[1]"] < 2.0e-6 * 2000
-    assert sigma["accelerometer.bias_ug[0]"] < 1.5
+    assert sigma["accelerometer.bias_ug[0]"] < 2.0  # five degrees of freedom of the wander: a third larger
     assert sigma["accelerometer.quadratic_ug_per_g2[1]"] < 1.8
     assert sigma["size_effect.r_mm.x[1]"] < 0.06
     assert sigma["skew_ms"] < 0.008
@@ -769,8 +769,8 @@ def test_the_plan_predicts_the_uncertainty_that_is_stated_then(result):
             if one.path in stated
         ]
     )
-    # the plan knows neither the wander that is found then, 0.9 ug here, nor how the hand will move
-    assert 0.4 < ratios.min() < ratios.max() < 1.6
+    # the plan knows neither the wander that is found then, in five degrees of freedom, nor how the hand will move
+    assert 0.3 < ratios.min() < ratios.max() < 1.6
     assert 0.75 < np.median(ratios) < 1.25
 
 
