@@ -769,7 +769,7 @@ def test_the_plan_predicts_the_uncertainty_that_is_stated_then(result):
             if one.path in stated
         ]
     )
-    # the plan knows neither the wander that is found then, in five degrees of freedom, nor how the hand will move
+    # the plan knows neither the wander found then, in five degrees of freedom, nor how the hand will move
     assert 0.3 < ratios.min() < ratios.max() < 1.6
     assert 0.75 < np.median(ratios) < 1.25
 
