@@ -186,8 +186,6 @@ def is_socket(fd: str) -> bool:
         return False
 
 
-# Open: in one of about eight runs nothing more comes after the publisher has waited for the one that hangs.
-@pytest.mark.xfail(strict=False, reason="publication stalls now and then after it waited for a subscriber")
 def test_a_subscriber_that_hangs_costs_the_others_nothing_and_is_served_again(
     batch, urls: tuple[str, str], tmp_path: Path
 ) -> None:
@@ -214,7 +212,8 @@ def test_a_subscriber_that_hangs_costs_the_others_nothing_and_is_served_again(
                 before = len(received)
                 received.extend(receiver)  # up to a pause
                 moved_s = time.monotonic() if len(received) > before else moved_s
-                assert time.monotonic() < moved_s + STALL_S, f"nothing comes any more: {sink.state}"
+                if time.monotonic() > moved_s + STALL_S:  # an open defect, seen in one of about eight runs
+                    pytest.xfail(f"nothing comes any more after the publisher has waited: {sink.state}")
                 return reached()
 
             until(step)
