@@ -29,6 +29,10 @@ EVENTS: Final = "events"
 _AT_ONCE: Final = SIZE << 9
 _BUFFER: Final = 1 << 22
 _JOIN_S: Final = 1.0
+_WAIT_S: Final = 1.0
+"""Longest that a publisher waits for a subscriber whose queues are full; it loses what comes after that. At 1 kHz
+the queues of the system hold minutes: only a replay at full speed waits at all."""
+_WAIT_KEY: Final = "transport/link/tx/queue/congestion_control/drop/wait_before_drop"
 _COLLECT_S: Final = 0.005
 """Time for which samples are collected: a message for each would wake this thread in the middle of the loop,
 and take a subscriber of 50 units two processors."""
@@ -66,19 +70,18 @@ class Publication:
         _require_one(url)
         self._session = _session(zenoh, url)
         self._error = zenoh.ZError
-        block = zenoh.CongestionControl.BLOCK
-        # A status that a congested subscriber does not get is followed by another one.
-        kinds = {"": block, STATUS: zenoh.CongestionControl.DROP, EVENTS: block}
         try:
             self._publishers = {
                 kind: self._session.declare_publisher(
                     f"{url.address}/{kind}".rstrip("/"),
                     encoding=zenoh.Encoding.APPLICATION_JSON if kind else zenoh.Encoding.ZENOH_BYTES,
-                    congestion_control=congestion_control,
+                    # After `_WAIT_S`. BLOCK would close the connection of the subscriber that hangs, upon which
+                    # the session may stop for all (Zenoh 1.10: github.com/eclipse-zenoh/zenoh/issues/1876).
+                    congestion_control=zenoh.CongestionControl.DROP,
                     reliability=zenoh.Reliability.RELIABLE,
                     express=True,
                 )
-                for kind, congestion_control in kinds.items()
+                for kind in ("", STATUS, EVENTS)
             }
         except zenoh.ZError as error:
             self._session.close()
@@ -283,7 +286,9 @@ def _session(zenoh: Any, url: Url) -> Any:
     if path is not None and not Path(path).is_file():
         raise InputError(f"{url.text}: config: expected a file, there is none; check the path")
     try:
-        return zenoh.open(_on_this_computer(zenoh) if path is None else zenoh.Config.from_file(path))
+        config = _on_this_computer(zenoh) if path is None else zenoh.Config.from_file(path)
+        config.insert_json5(_WAIT_KEY, json.dumps(round(_WAIT_S * 1e6)))
+        return zenoh.open(config)
     except zenoh.ZError as error:
         raise InputError(f"{url.text}: cannot be opened: {error}") from error
 

@@ -45,10 +45,6 @@ def urls(tmp_path: Path) -> tuple[str, str]:
             "scouting": {"multicast": {"enabled": False}},
             "listen": {"endpoints": [endpoint] if how == "listen" else []},
             "connect": {"endpoints": [endpoint] if how == "connect" else [], "retry": {"period_max_ms": 200}},
-            # 5 s by default: how long a subscriber that does not read stops the publisher
-            "transport": {
-                "link": {"tx": {"queue": {"congestion_control": {"block": {"wait_before_close": 300_000}}}}}
-            },
         }
         (tmp_path / f"{name}.json5").write_text(json.dumps(config))
     return f"{KEY}?config={tmp_path / 'listen.json5'}", f"{KEY}?config={tmp_path / 'connect.json5'}"
@@ -197,23 +193,19 @@ def test_a_subscriber_that_hangs_costs_the_others_nothing_and_is_served_again(
         subprocess.Popen(command, stdout=out) as hanging,
         imudrv.receive(urls[1], timeout_s=0.01) as receiver,
     ):
-        sent, moved_s = 0, time.monotonic()
+        sent = 0
         received: list[Records] = []
 
         def send_until(reached: Callable[[], object]) -> None:
             def step() -> object:
-                nonlocal sent, moved_s
+                nonlocal sent
                 is_taken = not received or received[-1]["counter"][-1] == sent - 1
                 if is_taken and not sink.state.queued:  # as fast as the other one takes it
                     sink.publish(batch(sent, 4000))
                     sent += 4000
                 else:
                     sink.poll()
-                before = len(received)
                 received.extend(receiver)  # up to a pause
-                moved_s = time.monotonic() if len(received) > before else moved_s
-                if time.monotonic() > moved_s + STALL_S:  # an open defect, seen in one of about eight runs
-                    pytest.xfail(f"nothing comes any more after the publisher has waited: {sink.state}")
                 return reached()
 
             until(step)
@@ -237,10 +229,6 @@ def test_a_subscriber_that_hangs_costs_the_others_nothing_and_is_served_again(
         last = sent
         send_until(lambda: received[-1]["counter"][-1] >= last)  # its death stops nothing either
     sink.close()
-
-
-STALL_S = 60.0
-"""Many times what the publisher waits for one that hangs."""
 
 
 def most_queued() -> int:
