@@ -22,6 +22,7 @@ from typing import Any, Final
 
 import numba
 from numba.core.compiler import CompileResult
+from numba.core.runtime.nrt import rtsys
 from numba.core.serialize import dumps
 from numba.core.types import unliteral
 
@@ -30,6 +31,8 @@ from imudrv.compilation import missed_a_kernel
 _to_bytes: Final[Callable[[Any], bytes]] = dumps
 
 _unliteral: Final[Callable[[Any], Any]] = unliteral
+
+_start_memory: Final[Callable[[Any], None]] = rtsys.initialize
 
 _from_parts: Final[Callable[..., Any]] = CompileResult._rebuild  # noqa: SLF001
 
@@ -106,7 +109,8 @@ class _KernelCache:
     def load_overload(self, signature: Any, target: Any) -> Any:
         """Return the compiled function; None if there is none that is whole."""
         _hold_interrupts(target.codegen()._engine)  # noqa: SLF001
-        target.refresh()
+        # What compiling needs besides, half a second of each start, the compiler loads itself.
+        _start_memory(target)
         if self._folder is None:
             return None
         compiled = self._load(self._folder, signature, target)

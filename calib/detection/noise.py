@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.optimize import nnls
+import scipy  # its parts are loaded when they are used
 
 from imudrv.arrays import Array
 from imudrv.errors import InputError
@@ -112,7 +112,7 @@ def fit_noise_model(variance: Array, count: Array) -> tuple[float, float]:
         # over lag L, 1 / L of the differences are independent; their uncertainty is as large as they are
         weight = np.sqrt(count / lags) / np.maximum(expected, 1e-40)
         size = np.linalg.norm(laws * weight[:, None], axis=0)
-        parts, _ = nnls(laws * weight[:, None] / size, variance * weight)
+        parts, _ = scipy.optimize.nnls(laws * weight[:, None] / size, variance * weight)
         expected = laws @ (parts / size)
     white, walk = np.sqrt(parts / size).tolist()
     return white, walk

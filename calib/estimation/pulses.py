@@ -1,7 +1,7 @@
 """Velocity of a quantised accelerometer in motion, free of its pulses."""
 
 import numpy as np
-from scipy.interpolate import PchipInterpolator
+import scipy  # its parts are loaded when they are used
 
 from calib.estimation.channel import passages
 from calib.estimation.rigid_motion import RigidMotion
@@ -42,6 +42,6 @@ def without_quantisation(t_s: Array, increments: Array, pulse: float, motion: Ri
     fitted = motion.fitted(at, edges)
     middle = 0.5 * (fitted[at] + fitted[at - 1])
     inside = np.clip(np.arange(len(total)), at[0] - 0.5, at[-1] - 0.5)
-    deviation = PchipInterpolator(at - 0.5, edges - middle)(inside)
+    deviation = scipy.interpolate.PchipInterpolator(at - 0.5, edges - middle)(inside)
     smooth = np.clip(fitted + deviation, total - 0.5 * pulse, total + 0.5 * pulse)
     return np.asarray(np.diff(smooth, prepend=0.0), np.float64)

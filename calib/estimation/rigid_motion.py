@@ -10,8 +10,8 @@ Its integral is known but for rho, a bias, two tilts and the constant: all linea
 from typing import Final, NamedTuple
 
 import numpy as np
+import scipy  # its parts are loaded when they are used
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter1d
 
 from imudrv.arrays import Array
 
@@ -72,7 +72,7 @@ def rigid_motion(t_s: Array, C_nb: Array, dtheta_b: Array, a_b: Array, gravity: 
     """
     dt = np.gradient(t_s)[:, None]
     size = max(1, round(RATE_S / float(np.median(dt))))
-    omega = uniform_filter1d(dtheta_b, size, axis=0, mode="nearest") / dt
+    omega = scipy.ndimage.uniform_filter1d(dtheta_b, size, axis=0, mode="nearest") / dt
     axis_n = np.cumsum(dt * (C_nb @ a_b), axis=0)
     along = (omega @ a_b)[:, None]
     centripetal = along * omega - (omega * omega).sum(axis=1)[:, None] * a_b

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import scipy  # its parts are loaded when they are used
 from scipy.linalg import cholesky, solve_triangular
-from scipy.optimize import nnls
 
 from calib.noise.estimates import EstimatesCovariance
 from calib.noise.model import B, variance_terms
@@ -122,7 +122,7 @@ def _fit(tau_s: Array, variance: Array, independent: Array, estimates: Estimates
     for round_ in range(1 + ROUNDS):
         root = _root(covariance)
         whitened, size = _whitened(root, terms)
-        squares, norm = nnls(whitened, solve_triangular(root, variance, lower=True))
+        squares, norm = scipy.optimize.nnls(whitened, solve_triangular(root, variance, lower=True))
         squares /= size
         degrees = len(tau_s) - int(np.count_nonzero(squares))
         if round_ and norm**2 > HOPELESS * degrees:

@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
+import scipy  # its parts are loaded when they are used
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, eigh
-from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from calib.estimation.result import CENTROID_BASIS
@@ -450,7 +450,7 @@ def _wander(
         logs = np.log(np.diag(factor[0])).sum() + np.log(np.diag(inner[0])).sum() - np.log(scale).sum()
         return float(2.0 * logs + system.residual @ cho_solve(factor, system.residual) - fitted)
 
-    found = minimize(
+    found = scipy.optimize.minimize(
         deviance,
         np.array([0.1, 0.1]),
         bounds=[(0.0, 1.0)] * 2,

@@ -1,7 +1,7 @@
 """Noise from the variances of differences."""
 
 import numpy as np
-from scipy.optimize import nnls
+import scipy  # its parts are loaded when they are used
 
 from imudrv.arrays import Array
 
@@ -25,6 +25,6 @@ def fit_noise_model(variance: Array, model: Array, weight: Array) -> Array:
     """
     weighted = model * weight[:, None]
     size = np.linalg.norm(weighted, axis=0)
-    parts, _ = nnls(weighted / size, variance * weight)
+    parts, _ = scipy.optimize.nnls(weighted / size, variance * weight)
     fitted: Array = parts / size
     return fitted

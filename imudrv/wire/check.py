@@ -63,8 +63,10 @@ def check_table(check: Check) -> np.void:
     table["after"] = len(check.suffix)
     table["suffix"][: len(check.suffix)] = list(check.suffix)
     table["crc_table"] = _crc_table(check)
-    prefix = np.array(list(check.prefix), np.uint8)
-    table["init"], table["second"] = _absorb(prefix, 0, prefix.size, table, _register(check), 0)
+    table["init"] = _register(check)
+    if check.prefix:  # else no kernel need be loaded
+        prefix = np.array(list(check.prefix), np.uint8)
+        table["init"], table["second"] = _absorb(prefix, 0, prefix.size, table, table["init"], 0)
     return table
 
 
