@@ -1,6 +1,5 @@
 """Allan deviations against published numbers and another program; their coefficients; `calib noise`."""
 
-import importlib.util
 import json
 from itertools import pairwise
 from pathlib import Path
@@ -27,12 +26,12 @@ from imudrv.sinks.recorder import Recorder
 from imudrv.units import ARCSEC, DEG_PER_SQRT_H, UG
 from imudrv.wire.datagram import encode
 from imudrv.wire.encode import StreamEncoder
+from tools import psins_to_wire
 
 Array = NDArray[np.float64]
 LAYOUT = profiles.load("imu50-rs422").layout()
 TAU = 1e-3
 ARW, VRW = 0.5 * DEG_PER_SQRT_H, 3000.0 * UG  # a pulse a sample or more: the error of the count is white
-TOOLS = Path(__file__).parents[2] / "tools"
 
 
 def kept(n: int) -> NDArray[np.int8]:
@@ -424,24 +423,38 @@ def test_a_signed_certificate_is_not_copied_with_its_signature(folder: Path) -> 
     assert read_calibration(folder / "copy.yaml").signature is None
 
 
-@pytest.mark.parametrize("window", [(600, 960), (1020, 1500)])
+PARKED = pytest.mark.parametrize("window", [(600, 960), (1020, 1500)])
+"""Where the laser-gyro unit in its car was quietest, s."""
+
+
+@PARKED
 def test_a_parked_car_is_not_at_rest(
     data: Path, tmp_path: Path, window: tuple[int, int], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    spec = importlib.util.spec_from_file_location("psins_to_wire", TOOLS / "psins_to_wire.py")
-    assert spec is not None
-    assert spec.loader is not None
-    psins_to_wire = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(psins_to_wire)
     raw, document = tmp_path / "car.raw", tmp_path / "n.json"
     psins_to_wire.convert(data / "lasergyro.imu", raw)
     times = ("--from", str(window[0]), "--to", str(window[1]))
     assert noise(raw, "--profile", psins_to_wire.PROFILE, *times, "--json", document) == 3
     assert "not the noise of a unit at rest" in capsys.readouterr().out
-    channels = json.loads(document.read_text())["channels"]
-    limits = [one["upper_limits"]["angle_random_walk_deg_per_sqrt_h"]["value"] for one in channels[:3]]
+    found = json.loads(document.read_text())
+    walks = [one["upper_limits"]["angle_random_walk_deg_per_sqrt_h"] for one in found["channels"][:3]]
     # a unit of this class has some 0.005 deg/sqrt(h); the car shakes it ten times as much at most
-    assert 0.005 < min(limits) < max(limits) < 0.05
+    assert all(0.005 < walk["estimate"] < walk["value"] < 0.05 for walk in walks)
+    vertical = found["channels"][5]
+    walk = vertical["upper_limits"]["velocity_random_walk_ug_per_sqrt_hz"]
+    deviation = vertical["allan_deviation_si"][found["tau_s"].index(walk["tau_s"])]
+    assert walk["estimate"] == pytest.approx(deviation * walk["tau_s"] ** 0.5 / UG)
+
+
+@PARKED
+def test_a_parked_car_has_the_known_random_walks_at_most(data: Path, window: tuple[int, int]) -> None:
+    # the smallest sigma sqrt(tau) of the whole window, motion included, up to an eighth of its length
+    rows = psins_to_wire.read(data / "lasergyro.imu")[100 * window[0] : 100 * window[1]]
+    found = allan(np.concatenate([rows["gyro"] * 0.1, rows["accelerometer"] * 125.0], axis=1))
+    found = found.part(found.factors <= len(rows) / 8)
+    walks = np.sqrt((found.variance * found.factors[:, None] / 0.01).min(axis=0))
+    assert walks[:3].max() / 60.0 <= 0.045  # arcsec/sqrt(s) to deg/sqrt(h)
+    assert walks[5] <= 46.0
 
 
 def test_coefficients_of_a_sensor_are_three_numbers_or_absent() -> None:
