@@ -10,10 +10,10 @@ from calib.sensors import observability
 from calib.sensors.adjustment import Adjustment
 from calib.sensors.equations import ACCELEROMETER_WANDER_CEILING, GYRO_WANDER_CEILING
 from calib.sensors.evidence import Evidence
-from calib.sensors.result import Estimate, Judgement
+from calib.sensors.result import Estimate, Judgement, pose_of
 from imudrv.nav.earth import EARTH_RATE
 from imudrv.site import Site
-from imudrv.units import ARCSEC, DEG_PER_H, UG
+from imudrv.units import ARCSEC, DEG_PER_H, PPM, UG
 
 REDUCED_CAUTION: Final = 1.5
 REDUCED_BAD: Final = 2.0
@@ -60,6 +60,7 @@ def judge(
         yield Judgement(
             "note", f"Not observable, and kept at the start or left out: {', '.join(grouped(lacking))}."
         )
+    yield from _faces(adjustment, estimates)
 
 
 def dither_judgement(evidence: Evidence) -> Iterator[Judgement]:
@@ -75,6 +76,35 @@ def dither_judgement(evidence: Evidence) -> Iterator[Judgement]:
         f"The angle increments at rest carry dither: {lines}. Let the unit remove it from the increments, or "
         "lower it; the motions are then free of it.",
     )
+
+
+def _faces(adjustment: Adjustment, estimates: tuple[Estimate, ...]) -> Iterator[Judgement]:
+    """Yield the sentences on accelerometers that were not turned both up and down."""
+    up = set(map(pose_of, adjustment.attitudes))
+    for k, axis in enumerate("XYZ"):
+        absent = [side for side in (f"+{axis}", f"-{axis}") if side not in up]
+        known = []
+        for one in estimates:
+            sensor, _, name = one.path.removesuffix(f"[{k}]").partition(".")
+            if absent and one.observable and sensor == "accelerometer" and name in _TERMS:
+                unit, term = _TERMS[name]
+                size = one.value * PPM if name.startswith("scale") else 1.0
+                known.append(f"{one.sigma / size:.0f} {unit} in {term}")
+        if known:
+            yield Judgement(
+                "note",
+                f"Without a rest with {' or '.join(absent)} up, accelerometer {axis} is known to "
+                f"{' and '.join(known)}.",
+            )
+
+
+_TERMS: Final = {
+    "scale_pulse_per_m_s": ("ppm", "K"),
+    "scale": ("ppm", "scale"),
+    "quadratic_ug_per_g2": ("ug/g^2", "the quadratic term"),
+    "asymmetry_ppm": ("ppm", "the asymmetry"),
+}
+"""Unit and name of what an accelerometer shows best when it is turned both up and down."""
 
 
 def _wander(adjustment: Adjustment) -> Iterator[Judgement]:
