@@ -1,7 +1,8 @@
 """Messages to the operator: keys with values; a catalogue for each language has the sentences.
 
 A catalogue is a YAML file with one line for each key; its text is a Python format string with the values of
-the message. Text of `imudrv` (alignment, service, recordings) is the message `verbatim`.
+the message, whole numbers as `imudrv.wording.Count`. Text of `imudrv` (alignment, service, recordings) is the
+message `verbatim`.
 """
 
 from collections.abc import Mapping
@@ -10,6 +11,7 @@ from typing import TypeAlias, Union
 
 from imudrv.messages import LANGUAGES, language
 from imudrv.messages import catalogue as texts_of
+from imudrv.wording import Count
 
 __all__ = ["LANGUAGES", "Message", "Value", "catalogue", "english", "language", "message", "text", "verbatim"]
 
@@ -64,6 +66,6 @@ def _render(what: Message, texts: Mapping[str, str]) -> str:
             return _render(value, texts)
         if isinstance(value, tuple):
             return texts["separator"].join(str(shown(part)) for part in value)
-        return value
+        return Count(value) if isinstance(value, int) else value
 
     return texts[what.key].format(**{name: shown(value) for name, value in what.values.items()})

@@ -26,6 +26,7 @@ from imudrv.recording.reader import Recording
 from imudrv.records import Records
 from imudrv.units import ARCSEC, NS
 from imudrv.wire.layout import Sensor, Values
+from imudrv.wording import counted
 
 CHANNELS: Final = ("gyro X", "gyro Y", "gyro Z", "accelerometer X", "accelerometer Y", "accelerometer Z")
 LEAST_S: Final = 20.0
@@ -119,7 +120,7 @@ class NoiseResult:
                 )
             )
         if disturbed := sum(capture.disturbed for capture in self.captures):
-            places = "1 place" if disturbed == 1 else f"{disturbed} places"
+            places = counted(disturbed, "place")
             marks.append(("note", f"left out: motion, missing or flagged samples in {places}"))
         if self.calibration is None:
             marks.append(

@@ -15,6 +15,7 @@ from imudrv.files import shipped as shipped_files
 from imudrv.files.settings_file import SettingsFile, read_file
 from imudrv.site import Site
 from imudrv.units import DEG_PER_SQRT_H, MM
+from imudrv.wording import counted
 
 _FOLDER: Final = Path(__file__).parents[1] / "procedures"
 
@@ -94,7 +95,8 @@ def text(procedure: Procedure, site: Site) -> str:
     prediction = predicted(procedure, site)
     shortest, longest = procedure.turn_s
     rotations = sum(step.turns for step in procedure.runs)
-    lines = [f"{procedure.name}: {rotations} rotations, about {duration_s(procedure) / 60.0:.0f} min"]
+    minutes = duration_s(procedure) / 60.0
+    lines = [f"{procedure.name}: {counted(rotations, 'rotation')}, about {minutes:.0f} min"]
     lines += [
         f"  {step.id}: {side(step.up)} up, {side(step.east)} east; alignment of {step.align_s:g} s, then "
         f"{step.turns} x 180 deg in {shortest:g} to {longest:g} s with a rest of {step.rest_s:g} s"

@@ -7,8 +7,9 @@ from calib.noise.analysis import ChannelNoise, NoiseResult
 from calib.noise.model import KINDS, VELOCITY_WALK, Coefficient, N
 from calib.reports import figures
 from calib.reports.document import Block, Document, Figure, KeyValues, Paragraph, Section, Table, sanitise
-from calib.reports.format import counted, three_digits
+from calib.reports.format import three_digits
 from calib.reports.html import as_html
+from imudrv.wording import counted
 
 _NOTE = (
     "N is the square root of a two-sided density, as in IEEE 647 and 952: that of a one-sided one, "

@@ -14,6 +14,7 @@ from calib.sensors.certificate import software, why_none
 from calib.sensors.result import Estimate, SensorsResult
 from calib.sensors.verdict import worst_residuals
 from imudrv.units import ARCSEC, DEG, DEG_PER_H, DEG_PER_SQRT_H, UG
+from imudrv.wording import counted
 
 CORRELATED: Final = 0.9
 """Correlation that is named."""
@@ -146,12 +147,13 @@ def _gravity(result: SensorsResult) -> Iterator[Block]:
     adjustment = result.adjustment
     if adjustment is not None:
         gyro, accelerometer, *_ = adjustment.wander
+        freedom = counted(adjustment.degrees_of_freedom, "degree")
         rows += [
             ("wander", f"{gyro / DEG_PER_H:.4f} deg/h, {accelerometer / UG:.2f} ug from rest to rest"),
             (
                 "chi-square",
-                f"{adjustment.chi_square:.1f} with {adjustment.degrees_of_freedom} degrees of freedom, "
-                f"reduced {adjustment.reduced:.2f}; {adjustment.iterations} iterations",
+                f"{adjustment.chi_square:.1f} with {freedom} of freedom, reduced {adjustment.reduced:.2f}; "
+                f"{counted(adjustment.iterations, 'iteration')}",
             ),
         ]
     if result.faces is not None:

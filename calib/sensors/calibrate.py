@@ -61,6 +61,7 @@ from imudrv.nav.earth import earth_rate_n
 from imudrv.profiles.schema import Profile
 from imudrv.records import Records
 from imudrv.site import Site
+from imudrv.wording import counted
 
 EARTH_SIGMAS: Final = 5.0
 """Difference of the Earth rate from that of the site that is believed."""
@@ -207,8 +208,8 @@ def _pulses(capture: Capture, advance: Callable[[int], None]) -> Iterator[Record
     restarts = capture.tracker.counts.restarts
     if restarts > seen:  # it does not show in the numbers of the samples
         raise InputError(
-            f"{capture.path}: expected a unit that stays powered, got {restarts} restarts; divide the "
-            "capture there, each part is a session of its own"
+            f"{capture.path}: expected a unit that stays powered, got {counted(restarts, 'restart')}; divide "
+            "the capture there, each part is a session of its own"
         )
 
 

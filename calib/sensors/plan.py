@@ -12,6 +12,7 @@ from calib.sensors.prediction import MOTION_S, TYPICAL_SCALES, PlannedPose, addi
 from calib.sensors.verdict import grouped
 from imudrv.site import Site
 from imudrv.units import ARCSEC, PPM
+from imudrv.wording import counted
 
 _KINDS: Final = (
     ("gyro.scale", "gyro scale, ppm", TYPICAL_SCALES.gyro / ARCSEC * PPM),
@@ -45,7 +46,7 @@ def text(procedure: Procedure, site: Site) -> str:
     """
     rests = procedure.rests
     minutes = sum(rest.rest_s + MOTION_S for rest in rests) / 60.0
-    lines = [f"{procedure.name}: {len(rests)} rest{'s' * (len(rests) > 1)}, about {minutes:.0f} min"]
+    lines = [f"{procedure.name}: {counted(len(rests), 'rest')}, about {minutes:.0f} min"]
     for rest in rests:
         how = "" if rest.turn is None else f"; {rest.turn.deg:g} deg about {side(rest.turn.about)}"
         took = "" if rest.turn is None else f" in {rest.turn.seconds:g} s"

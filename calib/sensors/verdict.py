@@ -14,6 +14,7 @@ from calib.sensors.result import Estimate, Judgement, pose_of
 from imudrv.nav.earth import EARTH_RATE
 from imudrv.site import Site
 from imudrv.units import ARCSEC, DEG_PER_H, PPM, UG
+from imudrv.wording import counted
 
 REDUCED_CAUTION: Final = 1.5
 REDUCED_BAD: Final = 2.0
@@ -34,22 +35,21 @@ def judge(
     known = sum(one.observable for one in shown)
     yield Judgement(
         "good",
-        f"{len(evidence.rests)} rests and {len(evidence.links)} motions; {known} of {len(shown)} numbers "
-        "are observable.",
+        f"{counted(len(evidence.rests), 'rest')} and {counted(len(evidence.links), 'motion')}; {known} of "
+        f"{len(shown)} numbers are observable.",
     )
-    reduced, freedom = adjustment.reduced, adjustment.degrees_of_freedom
+    reduced, freedom = adjustment.reduced, counted(adjustment.degrees_of_freedom, "degree")
     if reduced > REDUCED_BAD:
         yield Judgement(
             "bad",
-            f"The reduced chi-square is {reduced:.2f} ({freedom} degrees of freedom), above {REDUCED_BAD:g}: "
+            f"The reduced chi-square is {reduced:.2f} ({freedom} of freedom), above {REDUCED_BAD:g}: "
             "the rests and motions contradict each other beyond the noise of the unit. No certificate is "
             "made.",
         )
     elif reduced > REDUCED_CAUTION:
         yield Judgement(
             "caution",
-            f"The reduced chi-square is {reduced:.2f} ({freedom} degrees of freedom), above "
-            f"{REDUCED_CAUTION:g}.",
+            f"The reduced chi-square is {reduced:.2f} ({freedom} of freedom), above {REDUCED_CAUTION:g}.",
         )
     if reduced > REDUCED_CAUTION:
         yield from dither_judgement(evidence)

@@ -17,6 +17,7 @@ from imudrv.imu.clock import STALL_EDGES_S
 from imudrv.messages import catalogue, named
 from imudrv.service.status import Status
 from imudrv.service.status_socket import ask
+from imudrv.wording import Count
 
 PERIOD_S: Final = 0.5
 
@@ -121,7 +122,7 @@ def _time_rows(status: Status, texts: Mapping[str, str]) -> Iterator[Row]:
         "skew": texts["unknown"] if clock.skew_ppm is None else f"{clock.skew_ppm:+.2f} ppm",
         "worst_s": clock.worst_s,
     }
-    steps = texts["clock_steps"].format(steps=clock.steps) if clock.steps else ""
+    steps = texts["clock_steps"].format(steps=Count(clock.steps)) if clock.steps else ""
     yield texts["clock"], texts["clock_value"].format(**model) + steps, ""
     names = [f"<{edge * 1e3:g}" for edge in STALL_EDGES_S] + [f">={STALL_EDGES_S[-1] * 1e3:g}"]
     stalls = [f"{n} {name}" for name, n in zip(names, clock.stalls, strict=True) if n]

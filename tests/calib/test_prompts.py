@@ -109,6 +109,11 @@ def test_values_are_formatted_and_messages_within_a_message_are_rendered() -> No
     )
 
 
+@pytest.mark.parametrize(("n", "shown"), [(1, "1 rest, about 31 min"), (12, "12 rests, about 31 min")])
+def test_a_noun_has_the_number_of_its_count(n: int, shown: str) -> None:
+    assert english(message("expected_rests", folder="s", rests=n, minutes=31.0)) == f"session s: {shown}"
+
+
 def test_text_from_elsewhere_is_shown_as_it_is() -> None:
     assert english(verbatim("{not a placeholder} 5 % +- 1")) == "{not a placeholder} 5 % +- 1"
 

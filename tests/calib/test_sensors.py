@@ -611,7 +611,7 @@ def test_saturated_samples_cost_the_rest_or_the_motion(solve, session, at_rest, 
     spoilt["status"][at : at + 5] |= 1 << 10
     found = solve(spoilt)
     assert what in [one.what for one in found.evidence.left]
-    assert all("5 samples are saturated or faulted" in one.reason for one in found.evidence.left)
+    assert all("5 saturated or faulted samples" in one.reason for one in found.evidence.left)
     assert len(found.evidence.rests) == (11 if at_rest else 12)
     assert len(found.evidence.links) == (9 if at_rest else 10)
 
