@@ -29,6 +29,7 @@ from calib.bench.web_console import WebConsole
 from calib.certificate import lever_arms_of
 from calib.inputs import require_six_axes
 from calib.messages import Message, language, message, text
+from calib.noise.fit import PART
 from calib.procedure import plan
 from calib.procedure.schema import Procedure
 from calib.reports.document import Document
@@ -347,7 +348,13 @@ def _plan_text(options: RunOptions) -> str:
         raise InputError("--plan: expected --site, for the latitude, or --rehearse")
     site = BENCH if options.site is None else settings_file.read(options.site, Site)
     procedure = plan.load(options.procedure or PROCEDURE)
-    return plan.text(procedure, site) if procedure.kind == "arms" else sensors_plan.text(procedure, site)
+    if procedure.kind == "arms":
+        return plan.text(procedure, site)
+    text = sensors_plan.text(procedure, site)
+    if procedure.kind == "noise":
+        longest_s = max(rest.rest_s for rest in procedure.rests) / PART
+        text += f"\naveraging times up to {longest_s:g} s, if the rest is not disturbed"
+    return text
 
 
 def _create(options: RunOptions, console: Console) -> Session:

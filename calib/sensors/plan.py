@@ -7,9 +7,9 @@ import numpy as np
 
 from calib.axes import side
 from calib.procedure.schema import Procedure
-from calib.sensors.adjustment import Free
+from calib.sensors.adjustment import NORMAL_GRAVITY, Free
 from calib.sensors.prediction import MOTION_S, TYPICAL_SCALES, PlannedPose, additions, predict_sensors
-from calib.sensors.verdict import grouped
+from calib.sensors.verdict import gravity_judgement, grouped
 from imudrv.site import Site
 from imudrv.units import ARCSEC, PPM
 from imudrv.wording import counted
@@ -71,6 +71,8 @@ def _shown(procedure: Procedure, site: Site) -> Iterator[str]:
         dark = sum(path.startswith(begin) for path in lacking)
         note = f"; {dark} of {len(sigma)} not observable" if dark else ""
         yield f"  {name:30}{max(sigma) / unit:10.3g}{note}"
+    for one in gravity_judgement(site, NORMAL_GRAVITY):
+        yield f"{one.mark}: {one.text}"
     attitudes = [[pose.C_nb for pose in poses]]
     for more, paths in additions(attitudes, lacking, site=site, rest_s=rest_s, free=Free()):
         yield f"add {more}: shows {', '.join(grouped(paths))}"
