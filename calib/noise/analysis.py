@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.identification import PriorCalibration, prior_calibration, software
 from calib.inputs import StrPath, profile_of, require_six_axes
-from calib.noise.bounds import Bound, bounds
+from calib.noise.bounds import Bound, bounds, is_of_pulses
 from calib.noise.estimates import EstimatesCovariance
 from calib.noise.fit import MOST_CHI_SQUARE, PART, Fit, fit, usable
 from calib.noise.model import ACCELEROMETER, GYRO, Coefficient
@@ -49,6 +49,8 @@ class ChannelNoise:
         The fitted model.
     bounds : tuple of Bound
         Upper limits for any data.
+    is_of_pulses : bool
+        Whether nothing but the count of pulses can be seen beside a random walk.
     """
 
     name: str
@@ -56,6 +58,7 @@ class ChannelNoise:
     deviation: Array
     fit: Fit
     bounds: tuple[Bound, ...]
+    is_of_pulses: bool
 
 
 class NoiseCapture(NamedTuple):
@@ -107,16 +110,26 @@ class NoiseResult:
     def verdicts(self) -> tuple[tuple[str, str], ...]:
         """Mark and reason, the worst first."""
         rejected = [channel for channel in self.channels if not channel.fit.is_accepted]
+        regular = [channel for channel in rejected if channel.is_of_pulses]
+        moved = [channel for channel in rejected if not channel.is_of_pulses]
+        nothing = len(rejected) == len(self.channels)
         marks = []
-        if rejected:
-            worst = max(channel.fit.reduced_chi_square for channel in rejected)
-            names = ", ".join(channel.name for channel in rejected)
+        if moved:
+            worst = max(channel.fit.reduced_chi_square for channel in moved)
             marks.append(
                 (
-                    "bad" if len(rejected) == len(self.channels) else "caution",
-                    f"{names}: not the noise of a unit at rest (reduced chi-square up to {worst:.3g}, "
-                    f"expected at most {MOST_CHI_SQUARE:g}): motion, vibration, a dither line, or pulses "
-                    "that come too regularly for a rest of this length; upper limits only",
+                    "bad" if nothing else "caution",
+                    f"{_names(moved)}: not the noise of a unit at rest (reduced chi-square up to "
+                    f"{worst:.3g}, expected at most {MOST_CHI_SQUARE:g}): motion, vibration or a dither "
+                    "line; upper limits only",
+                )
+            )
+        if regular:
+            marks.append(
+                (
+                    "bad" if nothing else "note",
+                    f"{_names(regular)}: pulses come too regularly for a rest of this length to show the "
+                    "noise beneath them; upper limits only; rest longer",
                 )
             )
         if disturbed := sum(capture.disturbed for capture in self.captures):
@@ -135,6 +148,10 @@ class NoiseResult:
     def is_bad(self) -> bool:
         """Whether nothing but upper limits was found."""
         return self.verdicts[0][0] == "bad"
+
+
+def _names(channels: Sequence[ChannelNoise]) -> str:
+    return ", ".join(channel.name for channel in channels)
 
 
 def analyse_noise(
@@ -187,12 +204,15 @@ def analyse_noise(
     pyramid = Pyramid(len(CHANNELS))
     read: list[NoiseCapture] = []
     intervals = set()
+    pulses = np.zeros(len(CHANNELS))
     for path in paths:
         try:
             with unchanged(path):  # a second pass is for the hash
                 opened = Capture(path, profile_of(profile), channel)
                 intervals.add(opened.layout.interval)
-                splitter = _splitter(opened, calibration)
+                scales, resolution = _scales(opened, calibration)
+                pulses = np.maximum(pulses, resolution)
+                splitter = StretchSplitter(float(opened.layout.interval) * NS, scales, resolution)
                 for piece in opened.pulses(advance):
                     pyramid.feed(*splitter.feed(_within(piece, window_s)))
                 pyramid.feed(*splitter.close())
@@ -209,7 +229,7 @@ def analyse_noise(
         )
     if len(intervals) > 1:
         raise InputError("captures: expected one sample rate, got several; analyse them one by one")
-    return _result(pyramid.result(), float(intervals.pop()) * NS, tuple(read), calibration)
+    return _result(pyramid.result(), float(intervals.pop()) * NS, pulses, tuple(read), calibration)
 
 
 def _have_calibrations(paths: Sequence[Path]) -> bool:
@@ -227,8 +247,8 @@ def _within(samples: Records, window_s: tuple[float, float] | None) -> Records:
     return inside
 
 
-def _splitter(capture: Capture, calibration: PriorCalibration | None) -> StretchSplitter:
-    """Return the splitter of a capture with the scale factors of the unit."""
+def _scales(capture: Capture, calibration: PriorCalibration | None) -> tuple[Array, Array]:
+    """Return the value of a count of each sensor of a unit, and the smallest change of its increments."""
     layout = require_six_axes(capture.layout)
     interval_s = float(layout.interval) * NS
     if calibration is not None:
@@ -236,8 +256,7 @@ def _splitter(capture: Capture, calibration: PriorCalibration | None) -> Stretch
         scales = np.concatenate([c.gyro_scale, 1.0 / c.accelerometer_scale])
     else:
         scales = _nominal_scales(capture.profile)
-    resolution = scales * np.repeat([_count(sensor, interval_s) for sensor in layout.sensors], 3)
-    return StretchSplitter(interval_s, scales, resolution)
+    return scales, scales * np.repeat([_count(sensor, interval_s) for sensor in layout.sensors], 3)
 
 
 def _nominal_scales(profile: Profile) -> Array:
@@ -267,6 +286,7 @@ def _count(sensor: Sensor, interval_s: float) -> float:
 def _result(
     allan: AllanVariance,
     interval_s: float,
+    pulses: Array,
     captures: tuple[NoiseCapture, ...],
     calibration: PriorCalibration | None,
 ) -> NoiseResult:
@@ -296,6 +316,7 @@ def _result(
             np.sqrt(allan.variance[:, k]) / interval_s,
             fit(fitted, k, interval_s, estimates),
             bounds(allan, k, interval_s),
+            is_of_pulses(allan, k, interval_s, float(pulses[k])),
         )
         for k, name in enumerate(CHANNELS)
     )

@@ -5,7 +5,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
-from calib.noise.model import KINDS, variance_terms
+from calib.noise.model import KINDS, N, variance_terms
 from calib.noise.pyramid import AllanVariance
 
 LEAST_INDEPENDENT: Final = 6.0
@@ -32,6 +32,27 @@ class Bound(NamedTuple):
     value: float
     estimate: float
     tau_s: float
+
+
+def is_of_pulses(allan: AllanVariance, channel: int, interval_s: float, pulse: float) -> bool:
+    """Return whether a count of pulses, with a random walk below its limit, explains what one channel shows.
+
+    The error of a count is uniform within a pulse. Where pulses come regularly it is no noise: one that
+    reverses from averaging time to averaging time has second differences with a mean square of 4/3 pulse^2,
+    which is the largest.
+
+    Parameters
+    ----------
+    allan, channel, interval_s
+        As in `bounds`.
+    pulse : float
+        Smallest change of theta, SI.
+    """
+    allan = allan.part(allan.independent >= LEAST_INDEPENDENT)
+    tau_s = allan.tau_s(interval_s)
+    walk = bounds(allan, channel, interval_s)[N].value
+    explained = (2.0 / 3.0) * (pulse / tau_s) ** 2 + walk**2 / tau_s
+    return bool((allan.variance[:, channel] / interval_s**2 <= explained).all())
 
 
 def bounds(allan: AllanVariance, channel: int, interval_s: float) -> tuple[Bound, ...]:

@@ -174,7 +174,7 @@ def test_a_line_is_not_described_by_the_model() -> None:
     assert not found.is_accepted
 
 
-def pulses(duration_s: float, seed: int = 1, rate: float = 0.0, **flags: int) -> Records:
+def pulses(duration_s: float, seed: int = 1, rate: float = 0.0, walk: float = VRW) -> Records:
     """Pulses of a unit with white noise, Z up; `rate`: about Z, rad/s, in the middle second of each ten."""
     n = round(duration_s / TAU)
     rng = np.random.default_rng(seed)
@@ -187,7 +187,7 @@ def pulses(duration_s: float, seed: int = 1, rate: float = 0.0, **flags: int) ->
     moving = (np.arange(n) // 1000) % 10 == 5
     angle[:, 2] += np.cumsum(rate * TAU * moving)
     velocity = np.cumsum(
-        VRW * TAU**0.5 * rng.normal(size=(n, 3)) + np.array([0.01, -0.02, 9.8]) * TAU, axis=0
+        walk * TAU**0.5 * rng.normal(size=(n, 3)) + np.array([0.01, -0.02, 9.8]) * TAU, axis=0
     )
     samples["gyro"] = np.diff(np.floor(angle / (0.5 * ARCSEC)), axis=0, prepend=0.0)
     samples["accelerometer"] = np.diff(np.floor(velocity * 2000.0), axis=0, prepend=0.0)
@@ -351,6 +351,25 @@ def test_a_gap_each_minute_pools_the_stretches_between(
     assert document["at_rest_s"] == pytest.approx(199.9, abs=0.1)
     # an eighth of a minute, and the next lower of four factors an octave
     assert 60.0 / 8.0 / 1.2 < document["channels"][0]["fitted_tau_s"][1] <= 60.0 / 8.0
+
+
+@pytest.mark.parametrize(("swing", "words"), [(0.0, "pulses come too regularly"), (4.0, "vibration")])
+def test_regular_pulses_are_told_from_a_vibration(
+    tmp_path: Path, swing: float, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    samples = pulses(60.0, walk=5.0 * UG)  # a pulse of 50 ug s: two minutes of noise
+    beside = swing * np.sin(2.0 * np.pi * 3.1 * np.arange(len(samples)) * TAU)
+    samples["accelerometer"] += np.diff(np.rint(beside), prepend=0.0).astype(np.int64)[:, None]
+    write(tmp_path / "rest.raw", samples)
+    assert noise(tmp_path / "rest.raw", "--profile", "imu50-rs422", "--json", tmp_path / "n.json") == 0
+    (said,) = [
+        one
+        for one in json.loads((tmp_path / "n.json").read_text())["verdicts"]
+        if one["reason"].startswith("accelerometer X, accelerometer Y, accelerometer Z: ")
+    ]
+    assert words in said["reason"]
+    assert said["verdict"] == ("caution" if swing else "note")
+    assert "UPPER LIMITS" in capsys.readouterr().out
 
 
 def test_a_moving_unit_is_refused_with_upper_limits(
