@@ -42,15 +42,8 @@ def signed_exchanges() -> list[Array]:
     return exchanges
 
 
-class Exchange(NamedTuple):
-    """The exchange that explains the motions."""
-
-    text: str  # empty: the axes are right
-    score: float  # mean difference with the axes as they are, in g
-
-
-def find_exchange(evidence: Evidence, p: Parameters) -> Exchange:
-    """Return whether axes are exchanged or reversed, and which.
+def find_exchange(evidence: Evidence, p: Parameters) -> str:
+    """Return which axes are exchanged or reversed.
 
     Parameters
     ----------
@@ -60,8 +53,8 @@ def find_exchange(evidence: Evidence, p: Parameters) -> Exchange:
 
     Returns
     -------
-    Exchange
-        No text where the axes are right, or the motions do not show it.
+    str
+        Empty where the axes are right, or the motions do not show it.
     """
     forces = [p.M @ (e - p.q * curved(e, p)) / p.gravity for e in (r.rate[3:] - p.b for r in evidence.rests)]
     carried: dict[float, list[tuple[Array, Array, Array]]] = {}
@@ -76,7 +69,7 @@ def find_exchange(evidence: Evidence, p: Parameters) -> Exchange:
                 parts.append((motion.C, before, after))
         carried[sense] = parts
     if not carried[1.0]:
-        return Exchange("", 0.0)
+        return ""
 
     def score(S: Array, sense: float) -> float:
         return float(np.mean([np.linalg.norm(dC.T @ S @ a - S @ b) for dC, a, b in carried[sense]]))
@@ -85,10 +78,10 @@ def find_exchange(evidence: Evidence, p: Parameters) -> Exchange:
     own_score = tried[0][0]
     best = min(tried, key=lambda one: one[0])
     if own_score < RIGHT or best[0] > BETTER * own_score:
-        return Exchange("", own_score)
+        return ""
     close = [one for one in tried if one[0] < 1.2 * best[0] + 0.01]
     texts = [explanation for _, S, sense in close for explanation in _explanations(S, sense)]
-    return Exchange(min(texts)[1], own_score)
+    return min(texts)[1]
 
 
 def _explanations(S: Array, sense: float) -> list[tuple[int, str]]:

@@ -231,7 +231,7 @@ def solve(
     )
     attitudes = start_attitudes(p, evidence, reference)
     poses = tuple(map(pose_of, attitudes))
-    if text := find_exchange(evidence, p).text:
+    if text := find_exchange(evidence, p):
         return failed(poses, (Judgement("bad", f"{text[0].upper()}{text[1:]}. No certificate is made."),))
     if faults := scale_faults(evidence, site.gravity, SCALE_LIMIT):
         return failed(poses, tuple(Judgement("bad", scale_text(fault)) for fault in faults))

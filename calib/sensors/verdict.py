@@ -60,7 +60,7 @@ def judge(
         yield Judgement(
             "note", f"Not observable, and kept at the start or left out: {', '.join(grouped(lacking))}."
         )
-    yield from _faces(adjustment, estimates)
+    yield from _one_sided(adjustment, estimates)
 
 
 def dither_judgement(evidence: Evidence) -> Iterator[Judgement]:
@@ -78,7 +78,7 @@ def dither_judgement(evidence: Evidence) -> Iterator[Judgement]:
     )
 
 
-def _faces(adjustment: Adjustment, estimates: tuple[Estimate, ...]) -> Iterator[Judgement]:
+def _one_sided(adjustment: Adjustment, estimates: tuple[Estimate, ...]) -> Iterator[Judgement]:
     """Yield the sentences on accelerometers that were not turned both up and down."""
     up = set(map(pose_of, adjustment.attitudes))
     for k, axis in enumerate("XYZ"):

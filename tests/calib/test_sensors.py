@@ -393,7 +393,7 @@ def test_a_wander_that_few_residuals_show_counts_for_more_than_its_likely_size(r
     Z = _whole_basis(Free(), len(found.attitudes))
     root = np.linalg.cholesky(covariance_of(found.system, Wander(0.0, 5.0 * UG)))
     draws = (replace(found.system, residual=root @ rng.standard_normal(len(root))) for _ in range(60))
-    sizes = [_wander(one, Z, found.p, found.p.gravity, 1e-5).accelerometer / UG for one in draws]
+    sizes = [_wander(one, Z, found.p, 1e-5).accelerometer / UG for one in draws]
     # 8 degrees of freedom: 5 ug sqrt(8 / 6) = 5.8, known to 4 % from 60 draws
     assert 5.1 < np.sqrt(np.mean(np.square(sizes))) < 6.5
 
