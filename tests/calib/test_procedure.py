@@ -261,6 +261,14 @@ def test_a_plan_shows_what_is_to_be_done_how_long_it_takes_and_how_accurate_it_i
     assert f"{worst:.4f}" in shown
 
 
+def test_the_plan_of_too_few_rotations_says_what_to_add(site: Site) -> None:
+    shown = text(procedure({"id": "z-up", "up": "+Z", "east": "+X", "turn_deg": 180}), site)
+
+    assert shown.startswith("test: 1 rotation, about ")
+    assert "  z-up: Z up, X east; " in shown
+    assert shown.endswith("does not determine the six differences of the sensing points; add: X up and Y up")
+
+
 def test_ten_turns_are_three_times_as_accurate_as_three_rotations(site: Site) -> None:
     three, ten = (predicted(load(name), site).differences_sigma for name in ("three-rotations", "ten-turns"))
 
