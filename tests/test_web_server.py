@@ -241,11 +241,11 @@ def test_the_monitor_serves_status_frames_of_a_running_service(tmp_path: Path) -
     assert {name for name, _, _ in shown["rows"]["en"]} >= {
         "unit",
         "port",
-        "rate",
+        "sample rate",
         "losses",
         "clock",
         "latency",
-        "BIT",
+        "status bits",
     }
     assert len(shown["rows"]["zh_CN"]) == len(shown["rows"]["en"])
     assert sum(count for _, count in shown["latency"]) > 0

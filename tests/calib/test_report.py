@@ -179,7 +179,7 @@ def test_every_rotation_has_a_verdict_or_a_reason_for_rejection(
 ) -> None:
     text = " ".join(as_text(document(identification, arms)).split())
     assert text.count("deg off the vertical; then") == 3
-    assert text.count("turned 30.0 deg, want 180 +- 5") == 3
+    assert text.count("turned 30.0 deg, expected 180 +- 5") == 3
 
 
 def marks_of(identification: IdentificationResult, **changes: object) -> list[tuple[str, str]]:

@@ -33,6 +33,7 @@ function plot(id) {
     h - 4 - (h - 8) * (v - low) / (high - low)));
   pen.stroke();
 }
+const short = (n) => (n < 1e4 ? String(n) : n < 1e7 ? `${Math.round(n / 1e3)}k` : `${Math.round(n / 1e6)}M`);
 const digits = (x) => (x < 10 ? x.toFixed(1) : x.toFixed(0));
 const time = (us) => (us < 1000 ? `${digits(us)} µs` : us < 1e6 ? `${digits(us / 1000)} ms` : `${digits(us / 1e6)} s`);
 function drawLatency() {  // the heights are logarithmic: one late sample of millions is seen
@@ -40,7 +41,7 @@ function drawLatency() {  // the heights are logarithmic: one late sample of mil
   $("latency").replaceChildren();
   for (const [us, count] of frame.latency) {
     const bin = add($("latency"), "div", "");
-    add(bin, "span", count ? String(count) : "");
+    add(bin, "span", count ? short(count) : "");
     add(bin, "i", "").style.height = `${4 * Math.log2(1 + count) / most}rem`;
     add(bin, "b", time(us));
   }
@@ -55,7 +56,7 @@ function draw() {
   if (lost) $("health").textContent = label("lost");
   else if (gone) $("health").textContent = `${label("no_service")}: ${frame.text}`;
   else if (frame)
-    $("health").textContent = `${label(frame.health)}  ${frame.reasons[language].join("; ") || label("no_problems")}`;
+    $("health").textContent = `${label(frame.health)}  ${frame.problems[language]}`;
   if (!frame || gone) return;
   $("rows").replaceChildren();
   for (const [name, text, kind] of frame.rows[language]) {
