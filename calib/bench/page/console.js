@@ -100,7 +100,7 @@ function drawPlot(id) {
   const shown = (v) => v.toFixed(id === "rate" ? 0 : 2), room = 42 * scale, y = (v) => h - 4 - (h - 8) * (v - low) / (high - low);
   pen.fillText(shown(high), 0, 12 * scale);
   pen.fillText(shown(low), 0, h - 3);
-  pen.strokeStyle = style.getPropertyValue("--do");
+  pen.strokeStyle = style.getPropertyValue("--blue");
   pen.lineWidth = 1.5 * scale;
   pen.beginPath();
   values.forEach((v, k) => v !== null && pen.lineTo(room + (w - room) * (k + KEPT - values.length) / KEPT, y(v)));
@@ -182,7 +182,7 @@ function drawResult() {
   if (result.gauge) element("caption", {}, $("arms")).textContent = label("points").replace("{gauge}", result.gauge);
   for (const [mark, text] of result.verdicts) {
     const line = element("li", { class: mark }, $("verdicts"));
-    element("b", {}, line).textContent = `${label(mark)}: `;
+    element("b", {}, line).textContent = `${label(mark)} `;
     line.append(inLanguage(text));
   }
   if (!result.r_mm) return;
