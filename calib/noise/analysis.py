@@ -10,6 +10,7 @@ import numpy as np
 
 from calib.identification import PriorCalibration, prior_calibration, software
 from calib.inputs import StrPath, profile_of, require_six_axes
+from calib.messages import Message, english, message
 from calib.noise.bounds import Bound, bounds
 from calib.noise.estimates import EstimatesCovariance
 from calib.noise.fit import MOST_CHI_SQUARE, PART, Fit, fit, usable
@@ -104,29 +105,25 @@ class NoiseResult:
 
     @property
     def verdicts(self) -> tuple[tuple[str, str], ...]:
+        """Mark and reason in English, the worst first."""
+        return tuple((mark, english(why)) for mark, why in self.judgements)
+
+    @property
+    def judgements(self) -> tuple[tuple[str, Message], ...]:
         """Mark and reason, the worst first."""
         rejected = [channel for channel in self.channels if not channel.fit.is_accepted]
         marks = []
         if rejected:
             worst = max(channel.fit.reduced_chi_square for channel in rejected)
-            names = ", ".join(channel.name for channel in rejected)
-            marks.append(
-                (
-                    "bad" if len(rejected) == len(self.channels) else "caution",
-                    f"{names}: not the noise of a unit at rest (reduced chi-square up to {worst:.3g}, "
-                    f"expected at most {MOST_CHI_SQUARE:g}): motion, vibration, a dither line, or pulses "
-                    "that come too regularly for a rest of this length; upper limits only",
-                )
-            )
+            names = tuple(channel.name for channel in rejected)
+            not_noise = message("not_noise_at_rest", names=names, reduced=worst, limit=MOST_CHI_SQUARE)
+            marks.append(("bad" if len(rejected) == len(self.channels) else "caution", not_noise))
         if disturbed := sum(capture.disturbed for capture in self.captures):
-            places = "1 place" if disturbed == 1 else f"{disturbed} places"
-            marks.append(("note", f"left out: motion, missing or flagged samples in {places}"))
+            marks.append(("note", message("places_left_out", places=disturbed)))
         if self.calibration is None:
-            marks.append(
-                ("note", "nominal scale factors of the profile; give the unit's own with --calibration")
-            )
+            marks.append(("note", message("nominal_scale_factors")))
         if not rejected:
-            marks.append(("good", "the noise is that of a unit at rest"))
+            marks.append(("good", message("noise_at_rest")))
         order = ("bad", "caution", "note", "good")
         return tuple(sorted(marks, key=lambda mark: order.index(mark[0])))
 

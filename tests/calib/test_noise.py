@@ -347,7 +347,7 @@ def test_a_gap_each_minute_pools_the_stretches_between(
     samples = pulses(200.0)
     write(tmp_path / "gaps.raw", samples[np.arange(len(samples)) % 60_000 >= 20])
     assert noise(tmp_path / "gaps.raw", "--profile", "imu50-rs422", "--json", tmp_path / "n.json") == 0
-    assert "left out: motion, missing or flagged samples in 3 places" in capsys.readouterr().out
+    assert "left out: motion, missing or flagged samples (places: 3)" in capsys.readouterr().out
     document = json.loads((tmp_path / "n.json").read_text())
     assert document["at_rest_s"] == pytest.approx(199.9, abs=0.1)
     # an eighth of a minute, and the next lower of four factors an octave

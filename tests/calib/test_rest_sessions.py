@@ -178,7 +178,7 @@ def test_a_session_of_the_noise_ends_with_the_result_of_the_command(tmp_path: Pa
     process = begun(folder, MINUTE, "bump")
     shown, _ = process.communicate(timeout=DEADLINE_S)
     assert process.returncode == 0, shown
-    assert "left out: motion, missing or flagged samples in 1 place\n" in shown
+    assert "left out: motion, missing or flagged samples (places: 1)\n" in shown
 
     found = analyse_noise([folder / "run-1.mcap"], calibration=folder / "before.yaml")
 

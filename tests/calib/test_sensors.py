@@ -12,6 +12,7 @@ import pytest
 from calib.cli import main
 from calib.detection.rest_bins import Noise
 from calib.estimation.dither_line import DitherLine
+from calib.messages import text
 from calib.procedure.plan import load as load_procedure
 from calib.procedure.schema import Procedure
 from calib.sensors.adjustment import Free, Wander, _wander, _whole_basis, covariance_of
@@ -635,6 +636,12 @@ def test_a_scale_far_off_nominal_is_named_with_its_ratio(solve, session, sensor,
     found = solve(spoilt)
     assert found.mark == "bad"
     assert any(re.search(words, one.text) for one in found.verdict)
+
+
+def test_the_verdict_follows_the_language(result):
+    chinese = [text(one.what, "zh_CN") for one in result.verdict]
+    assert any("个静止段、" in sentence for sentence in chinese)
+    assert not any(re.search("[a-z]{3,} [a-z]{2,}", sentence) for sentence in chinese)
 
 
 def test_without_measured_gravity_the_scales_are_uncertain_alike(solve, session, result):
