@@ -55,9 +55,8 @@ class WebConsole:
     def __init__(self, session: Session, address: str, language: str) -> None:
         self._session = session
         self._actions: SimpleQueue[dict[str, Any]] = SimpleQueue()
-        page = resources.files(__package__).joinpath("page")
         self._server = PageServer(
-            {file.name: file for file in page.iterdir() if file.is_file()},
+            resources.files(__package__).joinpath("page"),
             address,
             _token(session.folder / WEB_TOKEN),
             self._actions.put,

@@ -47,8 +47,7 @@ def serve(path: Path, address: str, say: Callable[[str], None], language: str) -
     """
     ask(path)
     page = resources.files(__package__).joinpath("page")
-    files = {file.name: file for file in page.iterdir() if file.is_file()}
-    with closing(PageServer(files, address, secrets.token_urlsafe(16), lambda _: None)) as server:
+    with closing(PageServer(page, address, secrets.token_urlsafe(16), lambda _: None)) as server:
         server.keep("hello", json.dumps({"kind": "hello", "language": language, "labels": page_labels()}))
         say(f"page for browsers: {server.url}")
         while True:
