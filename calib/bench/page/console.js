@@ -106,14 +106,18 @@ function sound() {
   bells = view.bells;
   wasReady = ready;
 }
-const width = (text) => [...text].reduce((sum, c) => sum + (c > "\u2e80" ? 1.75 : 1), 1);
+const pen = document.createElement("canvas").getContext("2d");
+function width(text) {  // in units of the font's size
+  pen.font = `800 100px ${getComputedStyle(document.body).fontFamily}`;
+  return pen.measureText(text).width / 100;
+}
 function drawText() {
   const lost = isLost();
   drawLabels();
   $("link").textContent = lost ? `○ ${label("lost")}` : `● ${label(acting ? "acting" : "viewing")}`;
   const big = lost ? label("lost") : ended ? label("over") : view ? inLanguage(view.big) : "";
   $("headline").textContent = big;
-  $("headline").style.setProperty("--width", width(big));
+  $("headline").style.setProperty("--width", width(big) || 1);
   const why = view ? (view.reasons.length ? view.reasons : view.hints.slice(0, 1)) : [];
   const rejected = view && view.phase === "verdict" && view.tone === "bad";
   const texts = rejected ? [...view.reasons, ...view.hints] : why;
@@ -160,7 +164,7 @@ function drawResult() {
   if (result.gauge) element("caption", {}, $("arms")).textContent = label("points").replace("{gauge}", result.gauge);
   for (const [mark, text] of result.verdicts) {
     const line = element("li", { class: mark }, $("verdicts"));
-    element("b", {}, line).textContent = `${label(mark)} `;
+    element("b", {}, line).textContent = label(mark);
     line.append(inLanguage(text));
   }
   if (!result.r_mm) return;
