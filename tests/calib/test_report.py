@@ -234,7 +234,7 @@ def test_three_rotations_are_noted_as_not_checked(identification: Identification
     assert "agreement" not in text
     notes = " ".join(text for mark, text in marks if mark == "note")
     assert "Arms determined, not checked: no redundant rotation" in notes
-    assert "include one of 0.5 ms" in notes
+    assert "include a skew of 0.5 ms" in notes
 
 
 @pytest.mark.parametrize(("p_shift", "level"), [(2.0, "good"), (20.0, "caution")])
