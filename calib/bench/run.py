@@ -65,6 +65,11 @@ REHEARSAL_PROFILE: Final = "imu50-rs422"
 _LINGER_S: Final = 0.2
 
 
+_CONNECT_S: Final = 10.0
+_POLL_S: Final = 0.01
+"""Longest wait for the driver to find a unit that has started, and the interval at which it is asked."""
+
+
 QUEUE_LIMIT: Final = 1000
 """Samples that may wait for the engine in a rehearsal at full speed."""
 
@@ -250,6 +255,9 @@ def conduct(session: Session, options: RunOptions, console: Console, web: WebCon
     def begin(steps: Procedure) -> None:
         if simulated is not None:
             simulated.begin(steps, profile)
+            deadline_s = time.monotonic() + _CONNECT_S
+            while service.port_state.trouble and time.monotonic() < deadline_s and not queue.is_closed:
+                time.sleep(_POLL_S)  # a rehearsal does not begin with a cable to be checked
 
     controller = SessionController(
         session,

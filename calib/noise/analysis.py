@@ -10,6 +10,7 @@ import numpy as np
 
 from calib.identification import PriorCalibration, prior_calibration, software
 from calib.inputs import StrPath, profile_of, require_six_axes
+from calib.messages import Message, english, message
 from calib.noise.bounds import Bound, bounds, is_of_pulses
 from calib.noise.estimates import EstimatesCovariance
 from calib.noise.fit import MOST_CHI_SQUARE, PART, Fit, fit, usable
@@ -26,7 +27,6 @@ from imudrv.recording.reader import Recording
 from imudrv.records import Records
 from imudrv.units import ARCSEC, NS
 from imudrv.wire.layout import Sensor, Values
-from imudrv.wording import counted
 
 CHANNELS: Final = ("gyro X", "gyro Y", "gyro Z", "accelerometer X", "accelerometer Y", "accelerometer Z")
 LEAST_S: Final = 20.0
@@ -108,6 +108,11 @@ class NoiseResult:
 
     @property
     def verdicts(self) -> tuple[tuple[str, str], ...]:
+        """Mark and reason in English, the worst first."""
+        return tuple((mark, english(why)) for mark, why in self.judgements)
+
+    @property
+    def judgements(self) -> tuple[tuple[str, Message], ...]:
         """Mark and reason, the worst first."""
         rejected = [channel for channel in self.channels if not channel.fit.is_accepted]
         regular = [channel for channel in rejected if channel.is_of_pulses]
@@ -116,31 +121,16 @@ class NoiseResult:
         marks = []
         if moved:
             worst = max(channel.fit.reduced_chi_square for channel in moved)
-            marks.append(
-                (
-                    "bad" if nothing else "caution",
-                    f"{_names(moved)}: not the noise of a unit at rest (reduced chi-square up to "
-                    f"{worst:.3g}, expected at most {MOST_CHI_SQUARE:g}): motion, vibration or a dither "
-                    "line; upper limits only",
-                )
-            )
+            why = message("not_noise_at_rest", names=_names(moved), reduced=worst, limit=MOST_CHI_SQUARE)
+            marks.append(("bad" if nothing else "caution", why))
         if regular:
-            marks.append(
-                (
-                    "bad" if nothing else "note",
-                    f"{_names(regular)}: pulses come too regularly for a rest of this length to show the "
-                    "noise beneath them; upper limits only; rest longer",
-                )
-            )
+            marks.append(("bad" if nothing else "note", message("regular_pulses", names=_names(regular))))
         if disturbed := sum(capture.disturbed for capture in self.captures):
-            places = counted(disturbed, "place")
-            marks.append(("note", f"left out: motion, missing or flagged samples in {places}"))
+            marks.append(("note", message("places_left_out", places=disturbed)))
         if self.calibration is None:
-            marks.append(
-                ("note", "nominal scale factors of the profile; give the unit's own with --calibration")
-            )
+            marks.append(("note", message("nominal_scale_factors")))
         if not rejected:
-            marks.append(("good", "the noise is that of a unit at rest"))
+            marks.append(("good", message("noise_at_rest")))
         order = ("bad", "caution", "note", "good")
         return tuple(sorted(marks, key=lambda mark: order.index(mark[0])))
 
@@ -150,8 +140,8 @@ class NoiseResult:
         return self.verdicts[0][0] == "bad"
 
 
-def _names(channels: Sequence[ChannelNoise]) -> str:
-    return ", ".join(channel.name for channel in channels)
+def _names(channels: Sequence[ChannelNoise]) -> tuple[str, ...]:
+    return tuple(channel.name for channel in channels)
 
 
 def analyse_noise(

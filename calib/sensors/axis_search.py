@@ -6,7 +6,6 @@ leaves hardly a difference. To change all axes at once, f to Q f and omega to de
 so of two explanations the one with fewer axes is named.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 from itertools import permutations, product
 from typing import Final, NamedTuple
@@ -147,10 +146,13 @@ def wrong_hemisphere(latitude: Latitude, site_sine: float) -> bool:
     return bool(sign * latitude.sine < -SIGN_SIGMAS * latitude.sigma and sign * latitude.sine < -0.02)
 
 
-def scale_faults(evidence: Evidence, gravity: float, most: float) -> Sequence[str]:
-    """Return the accelerometers whose scale is far off: each that was up and down shows it at once."""
+def scale_faults(evidence: Evidence, gravity: float, most: float) -> dict[str, float]:
+    """Return the accelerometers whose scale is far off, with its ratio to the nominal one.
+
+    Each that was up and down shows it at once.
+    """
     s = np.array([rest.rate[3:] for rest in evidence.rests])
-    faults = []
+    faults = {}
     for k, axis in enumerate("XYZ"):
         span = float(np.ptp(s[:, k]))
         others = np.linalg.norm(
@@ -159,5 +161,5 @@ def scale_faults(evidence: Evidence, gravity: float, most: float) -> Sequence[st
         if span > gravity and (others < 0.4 * gravity).all():
             ratio = span / (2.0 * gravity)
             if abs(ratio - 1.0) > most:
-                faults.append(f"accelerometer {axis} has {ratio:.3f} of its nominal scale")
+                faults[axis] = ratio
     return faults

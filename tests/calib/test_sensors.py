@@ -12,6 +12,7 @@ import pytest
 from calib.cli import main
 from calib.detection.rest_bins import Noise
 from calib.estimation.dither_line import DitherLine
+from calib.messages import text
 from calib.procedure.plan import load as load_procedure
 from calib.procedure.schema import Procedure
 from calib.sensors.adjustment import Free, Wander, _wander, _whole_basis, covariance_of
@@ -331,19 +332,19 @@ def test_a_face_missing_names_what_its_axis_is_known_to(solve, session, unit):
     found = solve(pieces(session, 0, 10))  # without -Y
     assert found.mark == "note"
     said = re.fullmatch(
-        r"Without a rest with -Y up, accelerometer Y is known to (\d+) ppm in K and (\d+) ug/g\^2 in the "
-        r"quadratic term\.",
+        r"Without a rest with -Y up, accelerometer Y is known to (\d+) ppm in its scale factor, "
+        r"(\d+) ug/g\^2 in the quadratic term\.",
         texts(found, "note"),
     )
     assert said
     value, truth = {one.path: one for one in found.estimates}, true_numbers(unit)
-    for text, path, scale in zip(
+    for size, path, scale in zip(
         said.groups(),
         ("accelerometer.scale_pulse_per_m_s[1]", "accelerometer.quadratic_ug_per_g2[1]"),
         (2000e-6, 1.0),
         strict=True,
     ):
-        assert value[path].sigma == pytest.approx(float(text) * scale, rel=0.05)
+        assert value[path].sigma == pytest.approx(float(size) * scale, rel=0.05)
         assert abs(value[path].value - truth[path]) < 4.0 * value[path].sigma
 
 
@@ -357,7 +358,9 @@ def test_one_loop_names_what_is_missing_and_the_loop_that_shows_it(solve):
     }
     said = texts(found, "note")
     assert "Not observable, and kept at the start or left out: gyro.C_bg[2][1]" in said
-    assert re.search(r"Without a rest with \+X or -X up, accelerometer X is known to \d+ ppm in K\.", said)
+    assert re.search(
+        r"Without a rest with \+X, -X up, accelerometer X is known to \d+ ppm in its scale factor\.", said
+    )
     (text,) = found.missing
     assert "four quarter turns about Y" in text
     assert "accelerometer.quadratic_ug_per_g2[0]" in text
@@ -677,6 +680,12 @@ def test_the_scales_of_another_profile_are_named(solve, session):
     for axis in "XYZ":
         assert re.search(rf"Accelerometer {axis} has (1\.9|2\.0)\d\d of its nominal scale", said)
     assert "more than 20% off: another profile, or a faulty channel" in said
+
+
+def test_the_verdict_follows_the_language(result):
+    chinese = [text(one.what, "zh_CN") for one in result.verdict]
+    assert any("个静止段、" in sentence for sentence in chinese)
+    assert not any(re.search("[a-z]{3,} [a-z]{2,}", sentence) for sentence in chinese)
 
 
 def test_without_measured_gravity_the_scales_are_uncertain_alike(solve, session, result):
