@@ -30,8 +30,8 @@ _AT_ONCE: Final = SIZE << 9
 _BUFFER: Final = 1 << 22
 _JOIN_S: Final = 1.0
 _WAIT_S: Final = 1.0
-"""Longest that a publisher waits for a subscriber whose queues are full; it loses what comes after that. At 1 kHz
-the queues of the system hold minutes: only a replay at full speed waits at all."""
+"""Longest that a publisher waits for a subscriber whose queues are full; it loses what comes after that. At
+1 kHz the queues of the system hold minutes: only a replay at full speed waits at all."""
 _WAIT_KEY: Final = "transport/link/tx/queue/congestion_control/drop/wait_before_drop"
 _COLLECT_S: Final = 0.005
 """Time for which samples are collected: a message for each would wake this thread in the middle of the loop,
@@ -75,8 +75,8 @@ class Publication:
                 kind: self._session.declare_publisher(
                     f"{url.address}/{kind}".rstrip("/"),
                     encoding=zenoh.Encoding.APPLICATION_JSON if kind else zenoh.Encoding.ZENOH_BYTES,
-                    # After `_WAIT_S`. BLOCK would close the connection of the subscriber that hangs, upon which
-                    # the session may stop for all (Zenoh 1.10: github.com/eclipse-zenoh/zenoh/issues/1876).
+                    # After `_WAIT_S`. BLOCK would close the connection of the subscriber that hangs, upon
+                    # which the session may stop for all (Zenoh 1.10: github.com/eclipse-zenoh/zenoh/issues/1876).
                     congestion_control=zenoh.CongestionControl.DROP,
                     reliability=zenoh.Reliability.RELIABLE,
                     express=True,
