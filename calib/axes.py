@@ -36,7 +36,8 @@ def side(axis: str) -> str:
     return axis.removeprefix("+")
 
 
-def axis_name(v_b: Array) -> str:
+def axis_name(v_b: Array) -> Side:
     """Return the signed body axis nearest to a vector, '+X' to '-Z'."""
     k = int(np.argmax(np.abs(v_b)))
-    return f"{'+' if v_b[k] > 0 else '-'}{'XYZ'[k]}"
+    positive: tuple[Side, ...] = ("+X", "+Y", "+Z")
+    return positive[k] if v_b[k] > 0 else opposite(positive[k])

@@ -21,6 +21,7 @@ from imudrv.recording.reader import Recording
 from imudrv.records import Flag, Reason, Records
 from imudrv.wire.candump import CandumpDecoder
 from imudrv.wire.decoder import CaptureDecoder, FrameDecoder, RejectedRuns
+from imudrv.wording import counted
 
 MANY_ERROR_FRAMES = 0.01
 """Ratio of error frames to messages above which a bus is faulty."""
@@ -134,8 +135,8 @@ class Capture:
         errors, messages = self.rejected.get(Reason.ERROR_FRAME), sum(self.channels.values())
         if errors is not None and errors.runs > MANY_ERROR_FRAMES * messages:
             hints.append(
-                f"{errors.runs} error frames beside {messages} messages: the bus is faulty; "
-                "check its wiring, termination and bit rate"
+                f"{counted(errors.runs, 'error frame')} beside {counted(messages, 'message')}: the bus is "
+                "faulty; check its wiring, termination and bit rate"
             )
         return hints
 

@@ -6,6 +6,8 @@ into exit code 2; any other exception that escapes is a defect of this product.
 
 from collections.abc import Sequence
 
+from imudrv.wording import counted
+
 
 class Imu50Error(Exception):
     """Base of all errors that this product raises on purpose."""
@@ -29,5 +31,4 @@ class FaultyFileError(InputError):
     def __init__(self, path: str, faults: Sequence[str]) -> None:
         self.path = path
         self.faults = tuple(faults)
-        count = "1 fault" if len(self.faults) == 1 else f"{len(self.faults)} faults"
-        super().__init__("\n  ".join([f"{path}: {count}", *self.faults]))
+        super().__init__("\n  ".join([f"{path}: {counted(len(self.faults), 'fault')}", *self.faults]))

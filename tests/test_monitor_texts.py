@@ -6,14 +6,15 @@ from string import Formatter
 
 import pytest
 
-from imudrv.messages import LANGUAGES, catalogue, named
+from imudrv.messages import LANGUAGES, catalogue, joined, named
 from imudrv.records import Reason
 from imudrv.service.latency import Latency, count_latency
 from imudrv.service.web_monitor import octaves
 
 
-def placeholders(text: str) -> list[tuple[str | None, str | None]]:
-    return sorted((name, form) for _, name, form, _ in Formatter().parse(text) if name)
+def placeholders(text: str) -> list[tuple[str, str]]:
+    fields = ((name, form or "") for _, name, form, _ in Formatter().parse(text) if name)
+    return sorted((name, form) for name, form in fields if "|" not in form)  # the words of a count
 
 
 @pytest.mark.parametrize("language", LANGUAGES)
@@ -39,6 +40,25 @@ def test_every_reason_of_rejection_has_a_text_in_every_language(language: str) -
     assert names == {reason.name.lower() for reason in Reason}
     assert named(texts, "rejected", "no_sync") == {"en": "no sync", "zh_CN": "无同步字"}[language]
     assert named(texts, "output", "no route to host") == "no route to host"
+
+
+@pytest.mark.parametrize(
+    ("items", "english", "chinese"),
+    [
+        ([], "", ""),
+        (["a; b"], "a; b", "a; b"),
+        (["a", "b"], "a, b", "a、b"),
+        (["bench, east", "b"], "bench, east; b", "bench, east；b"),
+        (["垂直、水平", "b"], "垂直、水平; b", "垂直、水平；b"),
+        (["垂直，水平", "b"], "垂直，水平; b", "垂直，水平；b"),
+        (["a; b, c", "d"], "(1) a; b, c; (2) d", "（1）a; b, c；（2）d"),
+    ],
+)
+def test_a_list_is_read_in_one_way_whatever_its_items_contain(
+    items: list[str], english: str, chinese: str
+) -> None:
+    assert joined(items, "en") == english
+    assert joined(items, "zh_CN") == chinese
 
 
 def test_the_histogram_of_latencies_has_every_sample_once_in_bins_of_a_factor_of_two() -> None:

@@ -28,9 +28,7 @@ class Served:
     def __init__(self, folder: Path) -> None:
         (folder / "index.html").write_text("<p>page</p>")
         self.received: list[dict[str, Any]] = []
-        self.server = PageServer(
-            {"index.html": folder / "index.html"}, "127.0.0.1:0", TOKEN, self.received.append
-        )
+        self.server = PageServer(folder, "127.0.0.1:0", TOKEN, self.received.append)
         self.base = self.server.url.partition("/?")[0]
 
     def open(self, session: Any, token: str = TOKEN, origin: str | None = None) -> Any:
@@ -171,13 +169,13 @@ def test_the_number_of_viewers_is_bounded(served: Served) -> None:
 @pytest.mark.parametrize("address", ["", "8650", "127.0.0.1:", "127.0.0.1:99999", ":80", "127.0.0.1:x"])
 def test_an_address_has_a_host_and_a_port(address: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="expected HOST:PORT, such as 127"):
-        PageServer({}, address, TOKEN, lambda _: None)
+        PageServer(tmp_path, address, TOKEN, lambda _: None)
 
 
-def test_an_address_in_use_is_named(served: Served) -> None:
+def test_an_address_in_use_is_named(served: Served, tmp_path: Path) -> None:
     address = served.base.removeprefix("http://")
     with pytest.raises(InputError, match=f"--web {address}: cannot be used: .*in use"):
-        PageServer({}, address, TOKEN, lambda _: None)
+        PageServer(tmp_path, address, TOKEN, lambda _: None)
 
 
 def test_files_outside_the_page_are_not_served(served: Served) -> None:
@@ -241,11 +239,11 @@ def test_the_monitor_serves_status_frames_of_a_running_service(tmp_path: Path) -
     assert {name for name, _, _ in shown["rows"]["en"]} >= {
         "unit",
         "port",
-        "rate",
+        "sample rate",
         "losses",
         "clock",
         "latency",
-        "BIT",
+        "status bits",
     }
     assert len(shown["rows"]["zh_CN"]) == len(shown["rows"]["en"])
     assert sum(count for _, count in shown["latency"]) > 0

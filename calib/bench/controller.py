@@ -134,6 +134,7 @@ class SessionController:
         self._recordings = SessionRecordings(session, service, self._queue)
         self._hands_free, self._accepts, self._begin = hands_free, accepts, begin
         self._watch, self._web = watch, web
+        self._line = service.port_state
         self._is_unit_detected = False
         self._conditions = Conditions()
         self._conditions_ns = 0
@@ -251,11 +252,11 @@ class SessionController:
                     web_s = max(web_s + PERIOD_S, time.monotonic() - PERIOD_S)  # no frame is made up for
                     if chosen := self._web.action(engine.view):
                         events += engine.handle(chosen)
-                    self._web.show(with_port_state(engine.view, self._service.port_state))
+                    self._web.show(self._view(engine))
                 last = self._apply_events(engine, events)
                 if events or is_due:
                     shown_s = time.monotonic()
-                    view = with_port_state(engine.view, self._service.port_state)
+                    view = self._view(engine)
                     self._watch(view)
                     self._screen.show(view, self._keys.question)
         except ServiceEndedError:
@@ -265,6 +266,15 @@ class SessionController:
         if self._web is not None:
             self._web.show(engine.view)  # the newest one may have come between two frames
         return last
+
+    def _view(self, engine: Engine) -> View:
+        """Return the engine's view with the state of the line, both of the samples that it has been fed.
+
+        The line may have ended while samples still wait: the engine then has data.
+        """
+        if not self._queue.has_samples:
+            self._line = self._service.port_state
+        return with_port_state(engine.view, self._line)
 
     def _feed(self, engine: Engine, batch: Batch) -> tuple[Event, ...]:
         """Feed samples to the engine; faults and temperatures once a second, or when the faults change."""

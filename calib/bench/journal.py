@@ -38,6 +38,7 @@ from imudrv.errors import InputError
 from imudrv.files import atomic
 from imudrv.files.json_text import load_json
 from imudrv.posix import O_BINARY
+from imudrv.wording import counted
 
 MAX_LINE: Final = 4 << 20
 """Longest line, bytes: the plan contains three settings files."""
@@ -72,7 +73,8 @@ class PartialLine(NamedTuple):
 
     def __str__(self) -> str:
         """Return a phrase for the user."""
-        return f"line {self.number}, the last, ends after {len(self.text)} bytes, as after a power cut"
+        size = counted(len(self.text), "byte")
+        return f"line {self.number}, the last, ends after {size}, as after a power cut"
 
 
 class SignedLines(NamedTuple):

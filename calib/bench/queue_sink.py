@@ -94,6 +94,11 @@ class QueueReader:
         self._backlog: deque[Batch] = deque()
         self._has_ended = False
 
+    @property
+    def has_samples(self) -> bool:
+        """Whether samples wait."""
+        return bool(self._backlog) or self._queue.state.queued > 0
+
     def next(self) -> Batch | None:
         """Return the next samples, those kept by `wait` first; see `take`."""
         return self._backlog.popleft() if self._backlog else self.take()

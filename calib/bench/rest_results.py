@@ -3,7 +3,7 @@
 from typing import Any, NamedTuple
 
 from calib.bench.state import SessionState
-from calib.messages import Message, verbatim
+from calib.messages import Message
 from calib.noise.analysis import analyse_noise
 from calib.noise.documents import certificate as noise_certificate
 from calib.reports import noise as noise_report
@@ -64,7 +64,7 @@ def calibrate_session(session: SessionState) -> RestsResult:
         procedure=session.procedure(),
     )
     return RestsResult(
-        tuple((one.mark, verbatim(one.text)) for one in result.verdict),
+        tuple((one.mark, one.what) for one in result.verdict),
         None if why_none(result) else sensors_certificate(result),
         sensors_report.document(result),
         "Parameters",
@@ -75,7 +75,7 @@ def analyse_session(session: SessionState) -> RestsResult:
     """Compute the noise from the recordings of a session."""
     result = analyse_noise(session.recordings(), calibration=session.initial_calibration())
     return RestsResult(
-        tuple((mark, verbatim(text)) for mark, text in result.verdicts),
+        result.judgements,
         None if result.is_bad else noise_certificate(result),
         noise_report.document(result),
         "Upper limits" if result.is_bad else "Coefficients",

@@ -29,6 +29,7 @@ from calib.bench.web_console import WebConsole
 from calib.certificate import lever_arms_of
 from calib.inputs import require_six_axes
 from calib.messages import Message, language, message, text
+from calib.noise.fit import PART
 from calib.procedure import plan
 from calib.procedure.schema import Procedure
 from calib.reports.document import Document
@@ -62,6 +63,11 @@ REHEARSAL_PROFILE: Final = "imu50-rs422"
 
 
 _LINGER_S: Final = 0.2
+
+
+_CONNECT_S: Final = 10.0
+_POLL_S: Final = 0.01
+"""Longest wait for the driver to find a unit that has started, and the interval at which it is asked."""
 
 
 QUEUE_LIMIT: Final = 1000
@@ -249,6 +255,9 @@ def conduct(session: Session, options: RunOptions, console: Console, web: WebCon
     def begin(steps: Procedure) -> None:
         if simulated is not None:
             simulated.begin(steps, profile)
+            deadline_s = time.monotonic() + _CONNECT_S
+            while service.port_state.trouble and time.monotonic() < deadline_s and not queue.is_closed:
+                time.sleep(_POLL_S)  # a rehearsal does not begin with a cable to be checked
 
     controller = SessionController(
         session,
@@ -347,7 +356,13 @@ def _plan_text(options: RunOptions) -> str:
         raise InputError("--plan: expected --site, for the latitude, or --rehearse")
     site = BENCH if options.site is None else settings_file.read(options.site, Site)
     procedure = plan.load(options.procedure or PROCEDURE)
-    return plan.text(procedure, site) if procedure.kind == "arms" else sensors_plan.text(procedure, site)
+    if procedure.kind == "arms":
+        return plan.text(procedure, site)
+    text = sensors_plan.text(procedure, site)
+    if procedure.kind == "noise":
+        longest_s = max(rest.rest_s for rest in procedure.rests) / PART
+        text += f"\naveraging times up to {longest_s:g} s, if the rest is not disturbed"
+    return text
 
 
 def _create(options: RunOptions, console: Console) -> Session:

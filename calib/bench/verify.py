@@ -45,6 +45,7 @@ from imudrv.errors import InputError
 from imudrv.files import atomic
 from imudrv.recording.reader import Recording
 from imudrv.units import MM
+from imudrv.wording import counted
 
 
 class Verified(NamedTuple):
@@ -144,7 +145,7 @@ def _verify_session(folder: Path, trusted: Mapping[str, str] | None) -> Verified
     faults = _signature_faults(folder, contents) + faulty_files(session, files)
     if not faults:
         faults = [*_disagreements(session), *_uncovered_steps(session)]
-    notes = [f"{len(contents.entries)} lines and {len(files)} files checked"]
+    notes = [f"{counted(len(contents.entries), 'line')} and {counted(len(files), 'file')} checked"]
     unknown = {path.name for path in folder.iterdir() if path.is_file()} - {
         *files,
         JOURNAL,

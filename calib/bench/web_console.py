@@ -17,9 +17,10 @@ from calib.bench.screen import PHASES, large_text, shown_last_try, shown_reasons
 from calib.bench.session import Session
 from calib.bench.simulated_unit import is_rehearsal
 from calib.bench.state import REPORTS, WEB_TOKEN
-from calib.messages import LANGUAGES, Message, catalogue, text
+from calib.messages import LANGUAGES, Message, text
 from calib.procedure.events import Action, View
 from calib.procedure.plan import all_steps
+from imudrv.messages import page_labels
 from imudrv.web.server import PageServer
 
 ADDRESS: Final = "127.0.0.1:8650"
@@ -31,9 +32,6 @@ PERIOD_S: Final = 0.05
 TOKEN_BYTES: Final = 16
 TOKEN: Final = re.compile(r"[A-Za-z0-9_-]{22}")
 """Form of a token of so many bytes."""
-
-_PREFIX: Final = "page_"
-"""Beginning of the keys of labels."""
 
 
 class WebConsole:
@@ -57,9 +55,8 @@ class WebConsole:
     def __init__(self, session: Session, address: str, language: str) -> None:
         self._session = session
         self._actions: SimpleQueue[dict[str, Any]] = SimpleQueue()
-        page = resources.files(__package__).joinpath("page")
         self._server = PageServer(
-            {file.name: file for file in page.iterdir() if file.is_file()},
+            resources.files(__package__).joinpath("page"),
             address,
             _token(session.folder / WEB_TOKEN),
             self._actions.put,
@@ -77,7 +74,7 @@ class WebConsole:
                 "simulated": is_rehearsal(session.folder),
                 "steps": steps,
                 "language": language,
-                "labels": {name: _labels(name) for name in LANGUAGES},
+                "labels": page_labels("calib.messages"),
                 "questions": {name: _texts(question) for name, question in QUESTIONS.items()},
             },
         )
@@ -139,12 +136,6 @@ class WebConsole:
 def _report(session: Session, name: str) -> bytes:
     """Return the content of a report; empty until it is written."""
     return (session.folder / name).read_bytes() if name in session.files else b""
-
-
-def _labels(language: str) -> dict[str, str]:
-    """Return the labels of the page by their names there."""
-    texts = catalogue(language)
-    return {key.removeprefix(_PREFIX): texts[key] for key in texts if key.startswith(_PREFIX)}
 
 
 def _texts(what: Message) -> dict[str, str]:

@@ -7,6 +7,7 @@ from typing import Final
 from calib.cli.arguments import add_workers
 from calib.fleet.reidentify import reidentify_all, sessions
 from imudrv.terminal import BAD_INPUT, NOT_GOOD, OK, say
+from imudrv.wording import counted
 
 EXAMPLE: Final = "sessions --workers 4"
 
@@ -27,7 +28,7 @@ def run(arguments: argparse.Namespace) -> int:
         say(str(one))
         faults += bool(one.fault)
         differing += one.shift_mm > _SAME_MM
-    say(f"{len(found)} sessions: {differing} differ, {faults} without a comparison")
+    say(f"{counted(len(found), 'session')}: {differing} differ, {faults} without a comparison")
     if faults:
         return BAD_INPUT
     return NOT_GOOD if differing else OK

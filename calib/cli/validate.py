@@ -25,6 +25,7 @@ from imudrv.files.inputs import total_size
 from imudrv.imu.rate_filter import NAMES, RateFilterName
 from imudrv.nav.alignment import ALIGNMENT_S
 from imudrv.terminal import NOT_GOOD, OK, console, progress
+from imudrv.wording import counted
 
 _MORE: Final = {"skew": skew_trials, "dither": dither_trials}
 EXAMPLE: Final = "--simulate rocking --seeds 20 --report validation.html"
@@ -87,7 +88,7 @@ def _simulated(arguments: argparse.Namespace) -> list[Validation]:
         for part in spread(function, work, arguments.workers, arguments.scheduler):
             found += part
             if status:
-                status.update(f"simulate: {len(found)} trials done")
+                status.update(f"simulate: {counted(len(found), 'trial')} done")
     return found
 
 

@@ -7,11 +7,12 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from calib.fleet.changes import Change, find_changes, unchanged
+from calib.fleet.changes import Change, Measurement, find_changes, unchanged
 from calib.fleet.index import ARMS, measurements
 from imudrv.errors import InputError
 from imudrv.files.atomic import atomic_write
 from imudrv.files.tables import table
+from imudrv.wording import counted
 
 _SHORT: Final = [name.removeprefix("arms.").replace("_mm", "").replace("_minus_", "-") for name in ARMS]
 _UNLIKELY: Final = 0.001
@@ -40,14 +41,14 @@ def drift(database: sqlite3.Connection, unit: str) -> Answer:
         raise InputError(f"--unit: expected a unit of the index, {units}, got {unit!r}")
     chi_square, freedom, p = unchanged(own)
     lines = [
-        f"unit {unit}: {len(own)} results; lever arms, mm, with 1 sigma",
+        f"unit {unit}: {counted(len(own), 'result')}; lever arms, mm, with 1 sigma",
         _row("date", "bench", _SHORT),
     ]
     for m in own:
         sigma = np.sqrt(np.diag(m.covariance))
         cells = [f"{value:+.3f} ± {s:.3f}" for value, s in zip(m.value, sigma, strict=True)]
         lines.append(_row(_date(m.t_days), m.bench, cells))
-    lines.append(f"nothing has changed: chi-square {chi_square:.1f}, {freedom} degrees of freedom, p {p:.2g}")
+    lines.append(f"nothing has changed: {_tested(chi_square, freedom)}, p {p:.2g}")
     changes = find_changes(fleet)
     drifts = [change for change in changes if (change.kind, change.name) == ("unit", unit)]
     lines += [f"drift, mm a month: {_values(change)}" for change in drifts]
@@ -62,11 +63,11 @@ def benches(database: sqlite3.Connection) -> Answer:
     fleet = measurements(database)
     found = find_changes(fleet)
     off = {change.name: change for change in found if change.kind == "bench"}
-    lines = [f"{len(fleet)} results of {len({m.unit for m in fleet})} units; lever arms, mm, with 1 sigma"]
+    lines = [f"{_results(fleet)}; lever arms, mm, with 1 sigma"]
     for name in sorted({m.bench for m in fleet}):
         own = [m for m in fleet if m.bench == name]
-        count = f"{len(own)} results of {len({m.unit for m in own})} units"
-        lines.append(_off(off[name]) if name in off else f"{_bench(name)}: agrees with the others, {count}")
+        agrees = f"{_bench(name)}: agrees with the others, {_results(own)}"
+        lines.append(_off(off[name]) if name in off else agrees)
     lines += [
         f"unit {change.name} drifts, mm a month: {_values(change)}"
         for change in found
@@ -142,13 +143,23 @@ def _sensors(database: sqlite3.Connection, unit: str) -> list[str]:
     return lines
 
 
+def _results(measurements: Sequence[Measurement]) -> str:
+    """Return how many results of how many units there are."""
+    units = len({m.unit for m in measurements})
+    return f"{counted(len(measurements), 'result')} of {counted(units, 'unit')}"
+
+
 def _chi_square(rows: Sequence[tuple[str, float, float | None, str]]) -> str:
     known = [(value, sigma) for _, value, sigma, _ in rows if sigma]
     if len(known) < len(rows):
         return ""
     value, sigma = np.array(known).T
     mean = np.average(value, weights=sigma**-2)
-    return f"; chi-square {np.sum(((value - mean) / sigma) ** 2):.1f}, {len(rows) - 1} degrees of freedom"
+    return f"; {_tested(np.sum(((value - mean) / sigma) ** 2), len(rows) - 1)}"
+
+
+def _tested(chi_square: float, freedom: int) -> str:
+    return f"chi-square {chi_square:.1f}, {counted(freedom, 'degree')} of freedom"
 
 
 def _row(date: str, bench: str, cells: Sequence[str]) -> str:

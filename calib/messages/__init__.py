@@ -1,15 +1,17 @@
 """Messages to the operator: keys with values; a catalogue for each language has the sentences.
 
 A catalogue is a YAML file with one line for each key; its text is a Python format string with the values of
-the message. Text of `imudrv` (alignment, service, recordings) is the message `verbatim`.
+the message, whole numbers as `imudrv.wording.Count`. Text of `imudrv` (alignment, service, recordings) is the
+message `verbatim`.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TypeAlias, Union
 
-from imudrv.messages import LANGUAGES, language
+from imudrv.messages import LANGUAGES, joined, language
 from imudrv.messages import catalogue as texts_of
+from imudrv.wording import Count
 
 __all__ = ["LANGUAGES", "Message", "Value", "catalogue", "english", "language", "message", "text", "verbatim"]
 
@@ -50,20 +52,17 @@ def english(what: Message) -> str:
 
 def text(what: Message, language: str) -> str:
     """Return the text of a message in one of `LANGUAGES`."""
-    return _render(what, catalogue(language))
+
+    def shown(value: Value) -> str | int | float:
+        if isinstance(value, Message):
+            return text(value, language)
+        if isinstance(value, tuple):
+            return joined((str(shown(part)) for part in value), language)
+        return Count(value) if isinstance(value, int) else value
+
+    return catalogue(language)[what.key].format(**{name: shown(value) for name, value in what.values.items()})
 
 
 def catalogue(language: str) -> Mapping[str, str]:
     """Return the texts of one of `LANGUAGES` by key."""
     return texts_of(language, __name__)
-
-
-def _render(what: Message, texts: Mapping[str, str]) -> str:
-    def shown(value: Value) -> str | int | float:
-        if isinstance(value, Message):
-            return _render(value, texts)
-        if isinstance(value, tuple):
-            return texts["separator"].join(str(shown(part)) for part in value)
-        return value
-
-    return texts[what.key].format(**{name: shown(value) for name, value in what.values.items()})

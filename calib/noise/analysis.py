@@ -10,7 +10,8 @@ import numpy as np
 
 from calib.identification import PriorCalibration, prior_calibration, software
 from calib.inputs import StrPath, profile_of, require_six_axes
-from calib.noise.bounds import Bound, bounds
+from calib.messages import Message, english, message
+from calib.noise.bounds import Bound, bounds, is_of_pulses
 from calib.noise.estimates import EstimatesCovariance
 from calib.noise.fit import MOST_CHI_SQUARE, PART, Fit, fit, usable
 from calib.noise.model import ACCELEROMETER, GYRO, Coefficient
@@ -48,6 +49,8 @@ class ChannelNoise:
         The fitted model.
     bounds : tuple of Bound
         Upper limits for any data.
+    is_of_pulses : bool
+        Whether nothing but the count of pulses can be seen beside a random walk.
     """
 
     name: str
@@ -55,6 +58,7 @@ class ChannelNoise:
     deviation: Array
     fit: Fit
     bounds: tuple[Bound, ...]
+    is_of_pulses: bool
 
 
 class NoiseCapture(NamedTuple):
@@ -104,29 +108,29 @@ class NoiseResult:
 
     @property
     def verdicts(self) -> tuple[tuple[str, str], ...]:
+        """Mark and reason in English, the worst first."""
+        return tuple((mark, english(why)) for mark, why in self.judgements)
+
+    @property
+    def judgements(self) -> tuple[tuple[str, Message], ...]:
         """Mark and reason, the worst first."""
         rejected = [channel for channel in self.channels if not channel.fit.is_accepted]
+        regular = [channel for channel in rejected if channel.is_of_pulses]
+        moved = [channel for channel in rejected if not channel.is_of_pulses]
+        nothing = len(rejected) == len(self.channels)
         marks = []
-        if rejected:
-            worst = max(channel.fit.reduced_chi_square for channel in rejected)
-            names = ", ".join(channel.name for channel in rejected)
-            marks.append(
-                (
-                    "bad" if len(rejected) == len(self.channels) else "caution",
-                    f"{names}: not the noise of a unit at rest (reduced chi-square up to {worst:.3g}, "
-                    f"expected at most {MOST_CHI_SQUARE:g}): motion, vibration, a dither line, or pulses "
-                    "that come too regularly for a rest of this length; upper limits only",
-                )
-            )
+        if moved:
+            worst = max(channel.fit.reduced_chi_square for channel in moved)
+            why = message("not_noise_at_rest", names=_names(moved), reduced=worst, limit=MOST_CHI_SQUARE)
+            marks.append(("bad" if nothing else "caution", why))
+        if regular:
+            marks.append(("bad" if nothing else "note", message("regular_pulses", names=_names(regular))))
         if disturbed := sum(capture.disturbed for capture in self.captures):
-            places = "1 place" if disturbed == 1 else f"{disturbed} places"
-            marks.append(("note", f"left out: motion, missing or flagged samples in {places}"))
+            marks.append(("note", message("places_left_out", places=disturbed)))
         if self.calibration is None:
-            marks.append(
-                ("note", "nominal scale factors of the profile; give the unit's own with --calibration")
-            )
+            marks.append(("note", message("nominal_scale_factors")))
         if not rejected:
-            marks.append(("good", "the noise is that of a unit at rest"))
+            marks.append(("good", message("noise_at_rest")))
         order = ("bad", "caution", "note", "good")
         return tuple(sorted(marks, key=lambda mark: order.index(mark[0])))
 
@@ -134,6 +138,10 @@ class NoiseResult:
     def is_bad(self) -> bool:
         """Whether nothing but upper limits was found."""
         return self.verdicts[0][0] == "bad"
+
+
+def _names(channels: Sequence[ChannelNoise]) -> tuple[str, ...]:
+    return tuple(channel.name for channel in channels)
 
 
 def analyse_noise(
@@ -186,12 +194,15 @@ def analyse_noise(
     pyramid = Pyramid(len(CHANNELS))
     read: list[NoiseCapture] = []
     intervals = set()
+    pulses = np.zeros(len(CHANNELS))
     for path in paths:
         try:
             with unchanged(path):  # a second pass is for the hash
                 opened = Capture(path, profile_of(profile), channel)
                 intervals.add(opened.layout.interval)
-                splitter = _splitter(opened, calibration)
+                scales, resolution = _scales(opened, calibration)
+                pulses = np.maximum(pulses, resolution)
+                splitter = StretchSplitter(float(opened.layout.interval) * NS, scales, resolution)
                 for piece in opened.pulses(advance):
                     pyramid.feed(*splitter.feed(_within(piece, window_s)))
                 pyramid.feed(*splitter.close())
@@ -208,7 +219,7 @@ def analyse_noise(
         )
     if len(intervals) > 1:
         raise InputError("captures: expected one sample rate, got several; analyse them one by one")
-    return _result(pyramid.result(), float(intervals.pop()) * NS, tuple(read), calibration)
+    return _result(pyramid.result(), float(intervals.pop()) * NS, pulses, tuple(read), calibration)
 
 
 def _have_calibrations(paths: Sequence[Path]) -> bool:
@@ -226,8 +237,8 @@ def _within(samples: Records, window_s: tuple[float, float] | None) -> Records:
     return inside
 
 
-def _splitter(capture: Capture, calibration: PriorCalibration | None) -> StretchSplitter:
-    """Return the splitter of a capture with the scale factors of the unit."""
+def _scales(capture: Capture, calibration: PriorCalibration | None) -> tuple[Array, Array]:
+    """Return the value of a count of each sensor of a unit, and the smallest change of its increments."""
     layout = require_six_axes(capture.layout)
     interval_s = float(layout.interval) * NS
     if calibration is not None:
@@ -235,8 +246,7 @@ def _splitter(capture: Capture, calibration: PriorCalibration | None) -> Stretch
         scales = np.concatenate([c.gyro_scale, 1.0 / c.accelerometer_scale])
     else:
         scales = _nominal_scales(capture.profile)
-    resolution = scales * np.repeat([_count(sensor, interval_s) for sensor in layout.sensors], 3)
-    return StretchSplitter(interval_s, scales, resolution)
+    return scales, scales * np.repeat([_count(sensor, interval_s) for sensor in layout.sensors], 3)
 
 
 def _nominal_scales(profile: Profile) -> Array:
@@ -266,6 +276,7 @@ def _count(sensor: Sensor, interval_s: float) -> float:
 def _result(
     allan: AllanVariance,
     interval_s: float,
+    pulses: Array,
     captures: tuple[NoiseCapture, ...],
     calibration: PriorCalibration | None,
 ) -> NoiseResult:
@@ -295,6 +306,7 @@ def _result(
             np.sqrt(allan.variance[:, k]) / interval_s,
             fit(fitted, k, interval_s, estimates),
             bounds(allan, k, interval_s),
+            is_of_pulses(allan, k, interval_s, float(pulses[k])),
         )
         for k, name in enumerate(CHANNELS)
     )

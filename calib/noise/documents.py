@@ -73,7 +73,12 @@ def _channel(channel: ChannelNoise) -> dict[str, Any]:
             if fit.is_accepted
         },
         "upper_limits": {
-            unit.key: {"value": bound.value / unit.si, "tau_s": bound.tau_s} for unit, bound in limits
+            unit.key: {
+                "value": bound.value / unit.si,
+                "estimate": bound.estimate / unit.si,
+                "tau_s": bound.tau_s,
+            }
+            for unit, bound in limits
         },
     }
 

@@ -2,10 +2,11 @@
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 from typing import Final
 
-from calib.axes import opposite, side
+from calib.axes import Side, opposite, side
 from calib.estimation.noise import SensorNoise
 from calib.estimation.predict import PlannedRotation, Prediction, predict
 from calib.procedure.preflight import PREFLIGHT_S
@@ -15,6 +16,7 @@ from imudrv.files import shipped as shipped_files
 from imudrv.files.settings_file import SettingsFile, read_file
 from imudrv.site import Site
 from imudrv.units import DEG_PER_SQRT_H, MM
+from imudrv.wording import counted
 
 _FOLDER: Final = Path(__file__).parents[1] / "procedures"
 
@@ -52,7 +54,14 @@ def predicted(procedure: Procedure, site: Site, skipped: Collection[str] = ()) -
     InputError
         The six differences are not observable from these rotations; names the directions.
     """
-    plan = [
+    try:
+        return predict(_rotations(procedure, skipped), site.latitude_rad, TYPICAL_NOISE)
+    except InputError as error:
+        raise InputError(f"procedure {procedure.name}: {error}") from error
+
+
+def _rotations(procedure: Procedure, skipped: Collection[str] = ()) -> list[PlannedRotation]:
+    return [
         PlannedRotation(
             step.up,
             step.turn_deg,
@@ -64,10 +73,21 @@ def predicted(procedure: Procedure, site: Site, skipped: Collection[str] = ()) -
         for step in procedure.runs
         if step.id not in skipped
     ]
-    try:
-        return predict(plan, site.latitude_rad, TYPICAL_NOISE)
-    except InputError as error:
-        raise InputError(f"procedure {procedure.name}: {error}") from error
+
+
+def _to_add(procedure: Procedure, site: Site) -> tuple[Side, ...]:
+    """Return the sides that have to be up in further rotations, the fewest that determine the arms."""
+    plan = _rotations(procedure)
+    sides: tuple[Side, ...] = ("+X", "+Y", "+Z")
+    for n in range(1, 4):
+        for ups in combinations(sides, n):
+            more = [replace(plan[-1], up=up) for up in ups]
+            try:
+                predict([*plan, *more], site.latitude_rad, TYPICAL_NOISE)
+            except InputError:
+                continue
+            return ups
+    return ()
 
 
 def turn_s(procedure: Procedure) -> float:
@@ -90,16 +110,25 @@ def duration_s(procedure: Procedure) -> float:
 
 
 def text(procedure: Procedure, site: Site) -> str:
-    """Return a plan as text: its steps, how long it takes, and its predicted accuracy; see `predicted`."""
-    prediction = predicted(procedure, site)
+    """Return a plan as text: its steps, how long it takes, and its predicted accuracy, or what to add."""
     shortest, longest = procedure.turn_s
     rotations = sum(step.turns for step in procedure.runs)
-    lines = [f"{procedure.name}: {rotations} rotations, about {duration_s(procedure) / 60.0:.0f} min"]
+    minutes = duration_s(procedure) / 60.0
+    lines = [f"{procedure.name}: {counted(rotations, 'rotation')}, about {minutes:.0f} min"]
     lines += [
         f"  {step.id}: {side(step.up)} up, {side(step.east)} east; alignment of {step.align_s:g} s, then "
         f"{step.turns} x 180 deg in {shortest:g} to {longest:g} s with a rest of {step.rest_s:g} s"
         for step in procedure.runs
     ]
+    try:
+        prediction = predicted(procedure, site)
+    except InputError:
+        ups = " and ".join(f"{side(up)} up" for up in _to_add(procedure, site))
+        if not ups:
+            raise
+        return "\n".join(
+            [*lines, f"does not determine the six differences of the sensing points; add: {ups}"]
+        )
     lines.append("expected accuracy (1 sigma), mm       X       Y       Z")
     for name, sigma in zip(("r_x - r_y", "r_x - r_z"), prediction.differences_sigma / MM, strict=True):
         lines.append(f"  {name:30}" + "".join(f"{value:8.4f}" for value in sigma))

@@ -7,7 +7,6 @@ reversed level gyro looks like a unit with the opposite heading.
 """
 
 from collections.abc import Iterator
-from functools import reduce
 from itertools import combinations
 from math import acos, atan2, sin
 from typing import Final
@@ -249,8 +248,7 @@ class _Pose:
         found += [gyro for P, _, gyro in _MISTAKES if self.fits(f_b, P @ omega_b)]
         if not found:
             return message("unexplained")
-        causes = reduce(lambda first, second: message("either", first=first, second=second), found)
-        return message("ambiguous", causes=causes) if len(found) > 1 else causes
+        return message("ambiguous", causes=tuple(found)) if len(found) > 1 else found[0]
 
 
 def _mistakes() -> Iterator[tuple[Array, Message, Message]]:

@@ -199,7 +199,7 @@ def _traceability(identification: IdentificationResult, say: Say) -> Iterator[Bl
 def _adjustment(prior: Calibration, given: Particulars, say: Say) -> Block:
     before, size_effect = message("adjustment_no_arms"), prior.size_effect
     if size_effect is not None:
-        arms = "; ".join(
+        arms = tuple(
             f"r_{i} ({', '.join(f'{v:+.3f}' for v in r)})"
             for i, r in zip("xyz", size_effect.r_m / MM, strict=True)
         )

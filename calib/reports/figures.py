@@ -177,6 +177,7 @@ def before_after(turns: Sequence[TurnResult]) -> bytes:
             bars = axes.barh(at + 0.2 * (2 * k - 1), speed, 0.34, color=(_GREY, COLOURS[0])[k], label=name)
             axes.bar_label(bars, fmt="%.1f", padding=3, fontsize=7)
         axes.set(xlabel="horizontal velocity after the rotation (mm/s)")
+        axes.margins(x=0.12)  # room for the longest bar's label
         axes.set_yticks(at, [f"turn {k + 1}" for k in at])
         axes.invert_yaxis()
         axes.grid(visible=False, axis="y")

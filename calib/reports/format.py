@@ -22,8 +22,3 @@ def decimals(sigma_m: Array) -> int:
     """Return the number of decimals, in mm, that shows two digits of the smallest nonzero uncertainty."""
     least = float(sigma_m[sigma_m > 1e-9].min(initial=1.0)) / MM
     return int(np.clip(1 - floor(log10(least)), 1, 5))
-
-
-def counted(n: int, what: str) -> str:
-    """Return a count with its noun: '1 rotation', '3 rotations'."""
-    return f"{n} {what}{'' if n == 1 else 's'}"

@@ -7,8 +7,9 @@ from calib.noise.analysis import ChannelNoise, NoiseResult
 from calib.noise.model import KINDS, VELOCITY_WALK, Coefficient, N
 from calib.reports import figures
 from calib.reports.document import Block, Document, Figure, KeyValues, Paragraph, Section, Table, sanitise
-from calib.reports.format import counted, three_digits
+from calib.reports.format import three_digits
 from calib.reports.html import as_html
+from imudrv.wording import counted
 
 _NOTE = (
     "N is the square root of a two-sided density, as in IEEE 647 and 952: that of a one-sided one, "
@@ -16,7 +17,8 @@ _NOTE = (
 )
 _LIMITS = (
     "95 %, and for any data: no other noise makes a deviation smaller. In brackets: averaging time. That of "
-    "Q is for an error of the pulse count that is white at that time."
+    "Q is for an error of the pulse count that is white at that time. Below each limit: the estimate at that "
+    "time, if nothing else made the deviation."
 )
 
 
@@ -80,13 +82,10 @@ def _limits(result: NoiseResult) -> Iterator[Block]:
             continue
         rows = []
         for k, unit in enumerate(channels[0].units):
-            cells = (
-                "-"
-                if channel.fit.is_accepted
-                else f"{three_digits(channel.bounds[k].value / unit.si)} ({channel.bounds[k].tau_s:.3g} s)"
-                for channel in channels
-            )
-            rows.append((f"{KINDS[k]} <=, {unit.unit}", *cells))
+            found = [None if channel.fit.is_accepted else channel.bounds[k] for channel in channels]
+            limits = (f"{three_digits(b.value / unit.si)} ({b.tau_s:.3g} s)" if b else "-" for b in found)
+            estimates = (three_digits(b.estimate / unit.si) if b else "-" for b in found)
+            rows += [(f"{KINDS[k]} <=, {unit.unit}", *limits), ("estimate", *estimates)]
         yield Table(title, ("", "X", "Y", "Z"), tuple(rows))
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from functools import partial
+from itertools import groupby
 from math import floor, log10
 from typing import Final
 
@@ -14,6 +15,7 @@ from calib.sensors.certificate import software, why_none
 from calib.sensors.result import Estimate, SensorsResult
 from calib.sensors.verdict import worst_residuals
 from imudrv.units import ARCSEC, DEG, DEG_PER_H, DEG_PER_SQRT_H, UG
+from imudrv.wording import counted
 
 CORRELATED: Final = 0.9
 """Correlation that is named."""
@@ -47,11 +49,13 @@ def _parameters(result: SensorsResult) -> Iterator[Block]:
         yield Paragraph("None was estimated.")
         return
     yield Paragraph("u is the standard uncertainty (k = 1), U the expanded one (k = 2).")
-    yield Table(
-        "Numbers of the certificate",
-        ("", "value", "u", "U", "observable", "before"),
-        tuple(_row(one) for one in result.estimates if one.is_shown),
-    )
+    shown = (one for one in result.estimates if one.is_shown)
+    for group, numbers in groupby(shown, lambda one: one.path.rpartition(".")[0]):
+        yield Table(
+            group or "others",
+            ("", "value", "u", "U", "observable", "before"),
+            tuple(_row(one) for one in numbers),
+        )
     if result.missing:
         yield KeyValues(tuple(("to add", sanitise(text)) for text in result.missing))
     if refusal := why_none(result):
@@ -59,7 +63,9 @@ def _parameters(result: SensorsResult) -> Iterator[Block]:
 
 
 def _row(one: Estimate) -> tuple[str, ...]:
-    unit, name = (ARCSEC, f"{one.path}, arcsec") if ".C_" in one.path else (1.0, one.path)
+    unit, name = 1.0, one.path.rpartition(".")[2]
+    if name.startswith("C_"):
+        unit, name = ARCSEC, f"{name}, arcsec"
     digits = _decimals(one.sigma / unit)
     return (
         name,
@@ -102,7 +108,7 @@ def _rests(result: SensorsResult) -> Iterator[Block]:
         )
     yield Table(
         "Rests, each with the motion after it; residuals in sigma; growth of a sigma without the rest",
-        ("rest", "start, s", "length, s", "degC", "residual", "motion, s", "residual", "growth"),
+        ("rest", "at, s", "length, s", "degC", "residual", "motion, s", "residual", "growth"),
         tuple(rows),
     )
     if evidence.left:
@@ -146,12 +152,13 @@ def _gravity(result: SensorsResult) -> Iterator[Block]:
     adjustment = result.adjustment
     if adjustment is not None:
         gyro, accelerometer, *_ = adjustment.wander
+        freedom = counted(adjustment.degrees_of_freedom, "degree")
         rows += [
             ("wander", f"{gyro / DEG_PER_H:.4f} deg/h, {accelerometer / UG:.2f} ug from rest to rest"),
             (
                 "chi-square",
-                f"{adjustment.chi_square:.1f} with {adjustment.degrees_of_freedom} degrees of freedom, "
-                f"reduced {adjustment.reduced:.2f}; {adjustment.iterations} iterations",
+                f"{adjustment.chi_square:.1f} with {freedom} of freedom, reduced {adjustment.reduced:.2f}; "
+                f"{counted(adjustment.iterations, 'iteration')}",
             ),
         ]
     if result.faces is not None:

@@ -31,7 +31,7 @@ def document(unit: str, validations: Sequence[Validation], drawn: int) -> Docume
         "Velocity error at rest without (Normal) and with size-effect compensation (Compensation)",
         (
             Section("Verdicts", tuple(_verdicts(validations))),
-            Section("Method", tuple(Paragraph(text) for text in _method())),
+            Section("Method", tuple(Paragraph(text) for text in _method(_has_twin(validations)))),
             *(Section(sanitise(one.trial.name), tuple(_trial(one))) for one in validations[:drawn]),
         ),
     )
@@ -60,23 +60,33 @@ def _verdicts(validations: Sequence[Validation]) -> Iterator[Block]:
     moved = [(one.trial.name, motion) for one in validations if (motion := one.trial.normal.aligned.motion)]
     if moved:
         yield KeyValues(tuple(("caution", sanitise(f"{name}: {motion}")) for name, motion in moved))
-    yield Table(
-        f"Horizontal velocity, mm/s: mean over the first {FIRST_S:g} s after the motion; then rms "
-        "difference from the twin over the whole rest after it",
-        ("", "Normal", "Comp.", "twin", "reduced", "Normal", "Comp."),
-        tuple(
-            (
-                sanitise(one.trial.name),
-                *(mm(v) for v in one.first),
-                f"{one.reduction:.2%}" if one.trial.expected == "reduced" else "",
-                *(mm(v) for v in one.effect),
-            )
-            for one in validations
-        ),
+    title = f"Horizontal velocity, mm/s: mean over the first {FIRST_S:g} s after the motion"
+    columns: Sequence[int] = (0, 1, 2, 4)
+    if _has_twin(validations):
+        title += "; then rms difference from the twin over the whole rest after it"
+        columns = range(7)
+    rows = [
+        (
+            sanitise(one.trial.name),
+            *(mm(v) for v in one.first),
+            f"{one.reduction:.2%}" if one.trial.expected == "reduced" else "",
+            *(mm(v) for v in one.effect),
+        )
+        for one in validations
+    ]
+    head, *body = (
+        tuple(row[k] for k in columns)
+        for row in [("", "Normal", "Comp.", "twin", "reduced", "Normal", "Comp."), *rows]
     )
+    yield Table(title, head, tuple(body))
 
 
-def _method() -> Iterator[str]:
+def _has_twin(validations: Sequence[Validation]) -> bool:
+    """Return whether there is a twin: there is none of recordings."""
+    return any(one.trial.twin is not None for one in validations)
+
+
+def _method(has_twin: bool) -> Iterator[str]:
     yield (
         "The same pulses are compensated, aligned and navigated twice, with the centroid of the three "
         "sensing points as origin. Only rests are evaluated, because the true velocity is zero there; "
@@ -88,6 +98,8 @@ def _method() -> Iterator[str]:
         "the same in both navigations and independent of the lever arms. 'Noise' is the velocity that the "
         "random walks of the sensors, estimated in the rests, cause in the time since the alignment."
     )
+    if not has_twin:
+        return
     yield (
         "'Twin' is a simulated unit with the same errors, noise and motion, but with accelerometers that all "
         "sense at one point, at the time of the gyros, and with gyros free of dither. Compensation can be "
@@ -105,19 +117,19 @@ def _trial(validation: Validation) -> Iterator[Block]:
             for name, row in zip(("Normal", "Compensation"), validation.first_n, strict=True)
         ),
     )
+    has_twin = _has_twin([validation])
+    rows = [
+        ("Normal", validation.before[0], validation.whole[0], validation.effect[0]),
+        ("Compensation", validation.before[1], validation.whole[1], validation.effect[1]),
+        *([("twin", nan, validation.whole[2], nan)] if has_twin else []),
+        ("change", nan, validation.change, nan),
+        ("noise", nan, validation.noise, nan),
+    ]
+    head = ("", "before", "after", *(["difference from the twin"] if has_twin else []))
     yield Table(
         "Horizontal velocity in the rests, rms, mm/s",
-        ("", "before", "after", "difference from the twin"),
-        tuple(
-            (name, *(mm(v) for v in values))
-            for name, values in (
-                ("Normal", (validation.before[0], validation.whole[0], validation.effect[0])),
-                ("Compensation", (validation.before[1], validation.whole[1], validation.effect[1])),
-                ("twin", (nan, validation.whole[2], nan)),
-                ("change", (nan, validation.change, nan)),
-                ("noise", (nan, validation.noise, nan)),
-            )
-        ),
+        head,
+        tuple((name, *(mm(v) for v in values))[: len(head)] for name, *values in rows),
     )
     yield Figure(
         f"{sanitise(trial.name)}: velocity error; grey: the motion, where velocity is not zero",

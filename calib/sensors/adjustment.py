@@ -125,7 +125,6 @@ class Adjustment:
     attitudes : tuple of ndarray, shape (3, 3)
         C_nb of each rest.
     covariance : ndarray, shape (COLUMNS, COLUMNS)
-    attitude_covariance : ndarray, shape (3 k, 3 k)
     residual : ndarray
         Of the equations at the end.
     residual_sigma : ndarray
@@ -142,7 +141,6 @@ class Adjustment:
     p: Parameters
     attitudes: tuple[Array, ...]
     covariance: Array
-    attitude_covariance: Array
     residual: Array
     residual_sigma: Array
     system: LinearSystem
@@ -214,7 +212,7 @@ def adjust(
             continue
         if is_wander_known:
             return _result(equations, p, attitudes, free, site_gravity, gravity_sigma, wander, iteration)
-        wander = _wander(equations.system(p, attitudes), Z, p, site_gravity, gravity_sigma)
+        wander = _wander(equations.system(p, attitudes), Z, p, gravity_sigma)
         is_wander_known = True
     raise NoConvergence(
         f"the adjustment does not converge: after {MOST_ITERATIONS} iterations a parameter still moves by "
@@ -422,9 +420,7 @@ def _scale_and_axes(matrix: Array) -> tuple[Array, Array]:
     return by_scale, by_axis
 
 
-def _wander(
-    system: LinearSystem, Z: Array, p: Parameters, site_gravity: float, gravity_sigma: float
-) -> Wander:
+def _wander(system: LinearSystem, Z: Array, p: Parameters, gravity_sigma: float) -> Wander:
     """Return the size of the wander that the residuals show, below its ceiling (restricted likelihood).
 
     Few residuals show it, so that its variance is uncertain, and errors over it are those of Student's t.
@@ -506,7 +502,7 @@ def _result(
     system = equations.system(p, attitudes)
     Z = _whole_basis(free, len(attitudes))
     solver = _Solver(system, Z, p, site_gravity, gravity_sigma, wander)
-    whole = Z @ solver.covariance @ Z.T
+    basis = Z[:COLUMNS]
     fitted = solver.J @ solver.covariance @ solver.J.T
     # below a hundredth of redundancy a residual has no information
     variance = np.maximum(np.diag(solver.V) - np.diag(fitted), 0.01 * np.diag(solver.V))
@@ -516,8 +512,7 @@ def _result(
     return Adjustment(
         p,
         tuple(attitudes),
-        whole[:COLUMNS, :COLUMNS],
-        whole[COLUMNS:, COLUMNS:],
+        basis @ solver.covariance @ basis.T,
         system.residual,
         np.sqrt(variance),
         system,

@@ -6,7 +6,6 @@ leaves hardly a difference. To change all axes at once, f to Q f and omega to de
 so of two explanations the one with fewer axes is named.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 from itertools import permutations, product
 from typing import Final, NamedTuple
@@ -42,15 +41,8 @@ def signed_exchanges() -> list[Array]:
     return exchanges
 
 
-class Exchange(NamedTuple):
-    """The exchange that explains the motions."""
-
-    text: str  # empty: the axes are right
-    score: float  # mean difference with the axes as they are, in g
-
-
-def find_exchange(evidence: Evidence, p: Parameters) -> Exchange:
-    """Return whether axes are exchanged or reversed, and which.
+def find_exchange(evidence: Evidence, p: Parameters) -> str:
+    """Return which axes are exchanged or reversed.
 
     Parameters
     ----------
@@ -60,8 +52,8 @@ def find_exchange(evidence: Evidence, p: Parameters) -> Exchange:
 
     Returns
     -------
-    Exchange
-        No text where the axes are right, or the motions do not show it.
+    str
+        Empty where the axes are right, or the motions do not show it.
     """
     forces = [p.M @ (e - p.q * curved(e, p)) / p.gravity for e in (r.rate[3:] - p.b for r in evidence.rests)]
     carried: dict[float, list[tuple[Array, Array, Array]]] = {}
@@ -76,7 +68,7 @@ def find_exchange(evidence: Evidence, p: Parameters) -> Exchange:
                 parts.append((motion.C, before, after))
         carried[sense] = parts
     if not carried[1.0]:
-        return Exchange("", 0.0)
+        return ""
 
     def score(S: Array, sense: float) -> float:
         return float(np.mean([np.linalg.norm(dC.T @ S @ a - S @ b) for dC, a, b in carried[sense]]))
@@ -85,10 +77,10 @@ def find_exchange(evidence: Evidence, p: Parameters) -> Exchange:
     own_score = tried[0][0]
     best = min(tried, key=lambda one: one[0])
     if own_score < RIGHT or best[0] > BETTER * own_score:
-        return Exchange("", own_score)
+        return ""
     close = [one for one in tried if one[0] < 1.2 * best[0] + 0.01]
     texts = [explanation for _, S, sense in close for explanation in _explanations(S, sense)]
-    return Exchange(min(texts)[1], own_score)
+    return min(texts)[1]
 
 
 def _explanations(S: Array, sense: float) -> list[tuple[int, str]]:
@@ -154,10 +146,13 @@ def wrong_hemisphere(latitude: Latitude, site_sine: float) -> bool:
     return bool(sign * latitude.sine < -SIGN_SIGMAS * latitude.sigma and sign * latitude.sine < -0.02)
 
 
-def scale_faults(evidence: Evidence, gravity: float, most: float) -> Sequence[str]:
-    """Return the accelerometers whose scale is far off: each that was up and down shows it at once."""
+def scale_faults(evidence: Evidence, gravity: float, most: float) -> dict[str, float]:
+    """Return the accelerometers whose scale is far off, with its ratio to the nominal one.
+
+    Each that was up and down shows it at once.
+    """
     s = np.array([rest.rate[3:] for rest in evidence.rests])
-    faults = []
+    faults = {}
     for k, axis in enumerate("XYZ"):
         span = float(np.ptp(s[:, k]))
         others = np.linalg.norm(
@@ -166,5 +161,5 @@ def scale_faults(evidence: Evidence, gravity: float, most: float) -> Sequence[st
         if span > gravity and (others < 0.4 * gravity).all():
             ratio = span / (2.0 * gravity)
             if abs(ratio - 1.0) > most:
-                faults.append(f"accelerometer {axis} has {ratio:.3f} of its nominal scale")
+                faults[axis] = ratio
     return faults

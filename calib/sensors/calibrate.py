@@ -13,7 +13,7 @@ import numpy as np
 
 from calib.detection.sections import split_at_restarts
 from calib.inputs import StrPath, profile_of, require_six_axes, site_of
-from calib.messages import english
+from calib.messages import message, verbatim
 from calib.procedure.planned_turn import turn_fault
 from calib.procedure.schema import Procedure
 from calib.sensors.adjustment import (
@@ -49,7 +49,7 @@ from calib.sensors.verdict import (
     grouped,
     judge,
     lacks_mandatory,
-    scale_text,
+    scale_judgement,
     temperature_judgement,
 )
 from imudrv.arrays import Array
@@ -61,6 +61,7 @@ from imudrv.nav.earth import earth_rate_n
 from imudrv.profiles.schema import Profile
 from imudrv.records import Records
 from imudrv.site import Site
+from imudrv.wording import counted
 
 EARTH_SIGMAS: Final = 5.0
 """Difference of the Earth rate from that of the site that is believed."""
@@ -207,8 +208,8 @@ def _pulses(capture: Capture, advance: Callable[[int], None]) -> Iterator[Record
     restarts = capture.tracker.counts.restarts
     if restarts > seen:  # it does not show in the numbers of the samples
         raise InputError(
-            f"{capture.path}: expected a unit that stays powered, got {restarts} restarts; divide the "
-            "capture there, each part is a session of its own"
+            f"{capture.path}: expected a unit that stays powered, got {counted(restarts, 'restart')}; divide "
+            "the capture there, each part is a session of its own"
         )
 
 
@@ -230,10 +231,10 @@ def solve(
     )
     attitudes = start_attitudes(p, evidence, reference)
     poses = tuple(map(pose_of, attitudes))
-    if text := find_exchange(evidence, p).text:
-        return failed(poses, (Judgement("bad", f"{text[0].upper()}{text[1:]}. No certificate is made."),))
+    if text := find_exchange(evidence, p):
+        return failed(poses, (_refused(text),))
     if faults := scale_faults(evidence, site.gravity, SCALE_LIMIT):
-        return failed(poses, tuple(Judgement("bad", scale_text(fault)) for fault in faults))
+        return failed(poses, tuple(scale_judgement("accelerometer", *fault) for fault in faults.items()))
     _require_hemisphere(evidence, p, site)
     equations = Equations(evidence, reference, options.free.fixed_pivot)
     try:
@@ -241,7 +242,7 @@ def solve(
     except NoConvergence as error:
         if options.free.fixed_pivot:
             _require_fixed_pivot(evidence, p, attitudes, options.free, gravity_sigma, reference)
-        bad = Judgement("bad", f"{error}. No certificate is made.")
+        bad = _refused(str(error))
         return failed(poses, (bad, *dither_judgement(evidence)))
     if options.free.fixed_pivot and found.reduced > REDUCED_BAD:
         _require_fixed_pivot(evidence, p, attitudes, options.free, gravity_sigma, reference)
@@ -270,14 +271,13 @@ def solve(
         result = replace(result, missing=tuple(_missing(result)))
     lacking = lacks_mandatory(result.estimates)
     if lacking and inputs.start is None:
-        verdict.append(
-            Judgement(
-                "note",
-                "No certificate is made: scales, biases and axes that are not observable have to come from "
-                "--start.",
-            )
-        )
+        verdict.append(Judgement("note", message("refused", why=message("start_lacking"))))
     return replace(result, verdict=tuple(verdict))
+
+
+def _refused(why: str) -> Judgement:
+    """Return the sentence on what is told in English only."""
+    return Judgement("bad", message("sensors_refused", why=verbatim(f"{why[0].upper()}{why[1:]}")))
 
 
 def _unplanned(poses: Sequence[str], procedure: Procedure | None) -> Iterator[Judgement]:
@@ -285,7 +285,7 @@ def _unplanned(poses: Sequence[str], procedure: Procedure | None) -> Iterator[Ju
     planned = dict(_planned(procedure)) if procedure else {}
     absent = [name for name in planned if name not in poses]
     if absent:
-        yield Judgement("note", f"Planned and not found: {', '.join(absent)}.")
+        yield Judgement("note", message("poses_absent", poses=tuple(absent)))
 
 
 def _turns(
@@ -300,7 +300,7 @@ def _turns(
         p = adjustment.p
         turned = p.W @ link.samples["gyro"].sum(axis=0) - p.beta * link.duration_s
         if fault := turn_fault(turn, turned.tolist()):
-            yield Judgement("caution", f"To {poses[link.after]}: {english(fault)}.")
+            yield Judgement("caution", message("turn_to_pose", pose=poses[link.after], why=fault))
 
 
 def _missing(result: SensorsResult) -> Iterator[str]:

@@ -161,7 +161,7 @@ class Equations:
             for k, by_bias in part.wander.items():
                 wander[rows, 6 * k : 6 * k + 6] += by_bias
             blocks.append(Block(rows, part.is_motion, part.number))
-        scaled = edges * np.concatenate([e.ravel() for e in self._edges])
+        scaled = edges * np.concatenate([np.tile(e, 2) for e in self._edges])
         V += scaled @ scaled.T
         return LinearSystem(residual, J, V, self._wander(wander), tuple(blocks))
 
@@ -169,13 +169,11 @@ class Equations:
         """Return the covariance of wandering gyros and accelerometers of unit size."""
         n, K = by_bias.shape[0], len(self.rests)
         by_rest = by_bias.reshape(n, K, 6)
-        gyro = np.einsum(
-            "nka,kl,mla->nm", by_rest[:, :, :3], self._correlation, by_rest[:, :, :3], optimize=True
+        gyro, accelerometer = (
+            np.einsum("nka,kl,mla->nm", own, self._correlation, own, optimize=True)
+            for own in (by_rest[:, :, :3], by_rest[:, :, 3:])
         )
-        acc = np.einsum(
-            "nka,kl,mla->nm", by_rest[:, :, 3:], self._correlation, by_rest[:, :, 3:], optimize=True
-        )
-        return gyro, acc
+        return gyro, accelerometer
 
     def _rest(
         self, k: int, rest: RestBins, own: Parameters, p: Parameters, C: Array, noise: Noise
@@ -290,7 +288,7 @@ def curved(e: Array, p: Parameters) -> Array:
 
 
 def edge_sigmas(rest: RestBins, noise: Noise, quanta: tuple[float, float]) -> Array:
-    """Return the uncertainty of the counts at the begin and the end of a rest, shape (2, 6), rad and m/s.
+    """Return the uncertainty of the counts at both ends of a rest, shape (6,), rad and m/s.
 
     The pulse, and the walk within the bin that the count is the mean of.
     """
@@ -298,8 +296,8 @@ def edge_sigmas(rest: RestBins, noise: Noise, quanta: tuple[float, float]) -> Ar
     quantum = np.repeat(quanta, 3)
     with np.errstate(divide="ignore", invalid="ignore"):
         pulses = np.where(quantum > 0.0, rest.rate * rest.bin_s / quantum, 0.0)
-    sigma = np.sqrt(walk + edge_variance(pulses) * quantum**2)
-    return np.stack([sigma, sigma])
+    sigma: Array = np.sqrt(walk + edge_variance(pulses) * quantum**2)
+    return sigma
 
 
 def wander_correlation(rests: Sequence[RestBins]) -> Array:

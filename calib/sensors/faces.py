@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from calib.axes import Side, axis_name, vector
 from calib.sensors.equations import skew_matrix
 from imudrv.arrays import Array
 from imudrv.errors import InputError
@@ -47,7 +48,7 @@ class Faces:
     C: Array
     theta_covariance: Array
     tilt_n: Array
-    squareness: dict[str, Array]
+    squareness: dict[Side, Array]
     repeatability: float
 
     @property
@@ -73,10 +74,8 @@ def find_faces(attitudes: Sequence[Array]) -> Faces:
     InputError
         Fewer than two different faces were up: a turn about the vertical is not determined.
     """
-    ups = np.array([C.T @ [0.0, 0.0, 1.0] for C in attitudes])
-    nearest = [int(np.argmax(np.abs(up))) for up in ups]
-    names = [f"{'+' if up[k] > 0.0 else '-'}{'XYZ'[k]}" for up, k in zip(ups, nearest, strict=True)]
-    if len(set(nearest)) < 2:
+    names = [axis_name(C.T @ [0.0, 0.0, 1.0]) for C in attitudes]
+    if len({name[1] for name in names}) < 2:
         raise InputError(
             f"frame faces: expected rests on faces of two axes at least, got {', '.join(sorted(set(names)))} "
             "up; use --frame gyro"
@@ -93,7 +92,7 @@ def find_faces(attitudes: Sequence[Array]) -> Faces:
 
 
 def _solve(
-    attitudes: Sequence[Array], C: Array, names: Sequence[str], faces: Sequence[str], setting: float
+    attitudes: Sequence[Array], C: Array, names: Sequence[Side], faces: Sequence[Side], setting: float
 ) -> tuple[Array, Array, Array]:
     """Return theta, p and d, their covariance, and the residuals along the faces, rad."""
     n = 5 + 3 * len(faces)
@@ -102,15 +101,14 @@ def _solve(
     N[5:, 5:] = np.eye(n - 5) / SQUARENESS**2
     rows, values = [], []
     for C_nb, name in zip(attitudes, names, strict=True):
-        e = np.zeros(3)
-        e["XYZ".index(name[1])] = 1.0 if name[0] == "+" else -1.0
+        e = vector(name)
         A = np.zeros((3, n))
         in_b = C @ C_nb.T
         A[:, :3] = -skew_matrix(e)  # theta x e
         A[:, 3:5] = -in_b[:, :2]
         at = 5 + 3 * faces.index(name)
         A[:, at : at + 3] = np.eye(3)
-        across = np.eye(3)[[k for k in range(3) if k != "XYZ".index(name[1])]]
+        across = np.eye(3)[e == 0.0]
         rows.append(across @ A)
         values.append(across @ (in_b[:, 2] - e))
     X, y = np.concatenate(rows), np.concatenate(values)

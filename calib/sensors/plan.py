@@ -7,11 +7,12 @@ import numpy as np
 
 from calib.axes import side
 from calib.procedure.schema import Procedure
-from calib.sensors.adjustment import Free
+from calib.sensors.adjustment import NORMAL_GRAVITY, Free
 from calib.sensors.prediction import MOTION_S, TYPICAL_SCALES, PlannedPose, additions, predict_sensors
-from calib.sensors.verdict import grouped
+from calib.sensors.verdict import gravity_judgement, grouped
 from imudrv.site import Site
 from imudrv.units import ARCSEC, PPM
+from imudrv.wording import counted
 
 _KINDS: Final = (
     ("gyro.scale", "gyro scale, ppm", TYPICAL_SCALES.gyro / ARCSEC * PPM),
@@ -45,7 +46,7 @@ def text(procedure: Procedure, site: Site) -> str:
     """
     rests = procedure.rests
     minutes = sum(rest.rest_s + MOTION_S for rest in rests) / 60.0
-    lines = [f"{procedure.name}: {len(rests)} rest{'s' * (len(rests) > 1)}, about {minutes:.0f} min"]
+    lines = [f"{procedure.name}: {counted(len(rests), 'rest')}, about {minutes:.0f} min"]
     for rest in rests:
         how = "" if rest.turn is None else f"; {rest.turn.deg:g} deg about {side(rest.turn.about)}"
         took = "" if rest.turn is None else f" in {rest.turn.seconds:g} s"
@@ -70,6 +71,8 @@ def _shown(procedure: Procedure, site: Site) -> Iterator[str]:
         dark = sum(path.startswith(begin) for path in lacking)
         note = f"; {dark} of {len(sigma)} not observable" if dark else ""
         yield f"  {name:30}{max(sigma) / unit:10.3g}{note}"
+    for one in gravity_judgement(site, NORMAL_GRAVITY):
+        yield f"{one.mark}: {one.text}"
     attitudes = [[pose.C_nb for pose in poses]]
     for more, paths in additions(attitudes, lacking, site=site, rest_s=rest_s, free=Free()):
         yield f"add {more}: shows {', '.join(grouped(paths))}"

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
-from calib.axes import Side, vector
+from calib.axes import Side, opposite, vector
 from calib.detection.rest_bins import Noise, RestBins
 from calib.sensors.adjustment import MEASURED_GRAVITY, NORMAL_GRAVITY, Free, information, posterior
 from calib.sensors.equations import Equations
@@ -73,8 +73,7 @@ class PlannedPose(NamedTuple):
 
 def turned(pose: PlannedPose) -> PlannedPose:
     """Return a pose turned half a circle about the vertical."""
-    other = ("-" if pose.east[0] == "+" else "+") + pose.east[1]
-    return pose._replace(east=other)  # type: ignore[arg-type]  # a side again
+    return pose._replace(east=opposite(pose.east))
 
 
 @dataclass(frozen=True)

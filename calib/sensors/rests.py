@@ -30,6 +30,7 @@ from imudrv.imu.rate_filter import RateFilter, rate_filter
 from imudrv.records import Flag, Records
 from imudrv.units import ARCSEC, NS
 from imudrv.wire.layout import Layout
+from imudrv.wording import counted
 
 GUARD_S: Final = 1.0
 """Time at both ends of a rest that counts as motion: the unit settles, s."""
@@ -302,7 +303,7 @@ def _bins(
         usable = [run for run in binner.runs if run[1]]
         stop_s = window.start_s + (window.stop - window.start) * samples_s(layout)
         if binner.bad:
-            reason = f"{binner.bad} samples are saturated or faulted: not used"
+            reason = f"{counted(binner.bad, 'saturated or faulted sample')}: not used"
             left.append(Left(session, window.start_s, stop_s, "rest", reason))
             continue
         if not usable:
@@ -428,7 +429,7 @@ class _Span:
         if self._lost:
             reason = "frames are lost in it"
         elif self._bad:
-            reason = f"{self._bad} samples are saturated or faulted"
+            reason = counted(self._bad, "saturated or faulted sample")
         elif self._too_long:
             reason = f"it lasts longer than {LONGEST_MOTION_S:g} s"
         elif not self._parts:

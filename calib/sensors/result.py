@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from calib.axes import axis_name
+from calib.messages import Message, english
 from calib.sensors import observability
 from calib.sensors.adjustment import Adjustment, Free
 from calib.sensors.evidence import Evidence
@@ -38,7 +39,12 @@ class Judgement(NamedTuple):
     """One sentence of the verdict."""
 
     mark: Mark
-    text: str
+    what: Message
+
+    @property
+    def text(self) -> str:
+        """The sentence in English."""
+        return english(self.what)
 
 
 class CaptureInput(NamedTuple):

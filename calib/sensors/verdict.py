@@ -6,14 +6,15 @@ from typing import Final
 
 import numpy as np
 
+from calib.messages import Message, message
 from calib.sensors import observability
 from calib.sensors.adjustment import Adjustment
 from calib.sensors.equations import ACCELEROMETER_WANDER_CEILING, GYRO_WANDER_CEILING
 from calib.sensors.evidence import Evidence
-from calib.sensors.result import Estimate, Judgement
+from calib.sensors.result import Estimate, Judgement, pose_of
 from imudrv.nav.earth import EARTH_RATE
 from imudrv.site import Site
-from imudrv.units import ARCSEC, DEG_PER_H, UG
+from imudrv.units import ARCSEC, DEG_PER_H, MGAL, PPM, UG
 
 REDUCED_CAUTION: Final = 1.5
 REDUCED_BAD: Final = 2.0
@@ -34,61 +35,74 @@ def judge(
     known = sum(one.observable for one in shown)
     yield Judgement(
         "good",
-        f"{len(evidence.rests)} rests and {len(evidence.links)} motions; {known} of {len(shown)} numbers "
-        "are observable.",
+        message(
+            "rests_and_motions",
+            rests=len(evidence.rests),
+            motions=len(evidence.links),
+            known=known,
+            shown=len(shown),
+        ),
     )
-    reduced, freedom = adjustment.reduced, adjustment.degrees_of_freedom
+    reduced, n = adjustment.reduced, adjustment.degrees_of_freedom
     if reduced > REDUCED_BAD:
-        yield Judgement(
-            "bad",
-            f"The reduced chi-square is {reduced:.2f} ({freedom} degrees of freedom), above {REDUCED_BAD:g}: "
-            "the rests and motions contradict each other beyond the noise of the unit. No certificate is "
-            "made.",
-        )
+        yield Judgement("bad", message("rests_contradict", reduced=reduced, n=n, limit=REDUCED_BAD))
     elif reduced > REDUCED_CAUTION:
-        yield Judgement(
-            "caution",
-            f"The reduced chi-square is {reduced:.2f} ({freedom} degrees of freedom), above "
-            f"{REDUCED_CAUTION:g}.",
-        )
+        yield Judgement("caution", message("reduced_large", reduced=reduced, n=n, limit=REDUCED_CAUTION))
     if reduced > REDUCED_CAUTION:
         yield from dither_judgement(evidence)
     yield from _wander(adjustment)
     yield from _blocks(adjustment, evidence, poses)
     yield from _scales(adjustment)
     if lacking:
-        yield Judgement(
-            "note", f"Not observable, and kept at the start or left out: {', '.join(grouped(lacking))}."
-        )
+        yield Judgement("note", message("numbers_unobservable", names=tuple(grouped(lacking))))
+    yield from _one_sided(adjustment, estimates)
 
 
 def dither_judgement(evidence: Evidence) -> Iterator[Judgement]:
     """Yield the sentence on dither in the increments, which contradicts the motions where it is large."""
     if not evidence.dither:
         return
-    lines = ", ".join(
-        f"{line.amplitude_rad / ARCSEC:.3g} arcsec at {line.frequency_hz:.0f} Hz about {line.axis}"
+    lines = tuple(
+        message(
+            "dither_of_gyro",
+            amplitude_arcsec=line.amplitude_rad / ARCSEC,
+            frequency_hz=line.frequency_hz,
+            axis=line.axis,
+        )
         for line in evidence.dither
     )
-    yield Judgement(
-        "caution",
-        f"The angle increments at rest carry dither: {lines}. Let the unit remove it from the increments, or "
-        "lower it; the motions are then free of it.",
-    )
+    yield Judgement("caution", message("dither_at_rest", lines=lines))
+
+
+def _one_sided(adjustment: Adjustment, estimates: tuple[Estimate, ...]) -> Iterator[Judgement]:
+    """Yield the sentences on accelerometers that were not turned both up and down."""
+    up = set(map(pose_of, adjustment.attitudes))
+    for k, axis in enumerate("XYZ"):
+        sides = tuple(side for side in (f"+{axis}", f"-{axis}") if side not in up)
+        own = [one for one in estimates if one.observable and one.path.endswith(f"[{k}]")]
+        known = tuple(filter(None, map(_known, own)))
+        if sides and known:
+            yield Judgement("note", message("side_absent", sides=sides, axis=axis, known=known))
+
+
+def _known(one: Estimate) -> Message | None:
+    """Return to what a number is known that an accelerometer shows best when it is turned up and down."""
+    if one.path.startswith("accelerometer.scale"):
+        return message("known_scale", size=one.sigma / (one.value * PPM))
+    if one.path.startswith("accelerometer.quadratic"):
+        return message("known_quadratic", size=one.sigma)
+    if one.path.startswith("accelerometer.asymmetry"):
+        return message("known_asymmetry", size=one.sigma)
+    return None
 
 
 def _wander(adjustment: Adjustment) -> Iterator[Judgement]:
     if adjustment.wander.gyro_exceeds:
-        yield Judgement(
-            "caution",
-            f"The biases of the gyros wander by more than {GYRO_WANDER_CEILING / DEG_PER_H:g} deg/h.",
-        )
+        limit = GYRO_WANDER_CEILING / DEG_PER_H
+        yield Judgement("caution", message("gyro_wander", limit_deg_per_h=limit))
     if adjustment.wander.accelerometer_exceeds:
-        yield Judgement(
-            "caution",
-            "The biases of the accelerometers wander by more than "
-            f"{ACCELEROMETER_WANDER_CEILING / UG:.0f} ug.",
-        )
+        limit = ACCELEROMETER_WANDER_CEILING / UG
+        yield Judgement("caution", message("accelerometer_wander", limit_ug=limit))
 
 
 def _blocks(adjustment: Adjustment, evidence: Evidence, poses: tuple[str, ...]) -> Iterator[Judgement]:
@@ -96,12 +110,11 @@ def _blocks(adjustment: Adjustment, evidence: Evidence, poses: tuple[str, ...]) 
         if sigmas > BLOCK_SIGMAS:
             if block.is_motion:
                 link = evidence.links[block.number]
-                before = evidence.rests[link.before]
-                name = f"the motion from {before.stop_s:.1f} s on"
+                at_s = evidence.rests[link.before].stop_s
+                yield Judgement("caution", message("residual_of_motion", at_s=at_s, sigmas=sigmas))
             else:
-                rest = evidence.rests[block.number]
-                name = f"the rest {poses[block.number]} at {rest.start_s:.1f} s"
-            yield Judgement("caution", f"A residual of {name} is {sigmas:.1f} sigma.")
+                pose, at_s = poses[block.number], evidence.rests[block.number].start_s
+                yield Judgement("caution", message("residual_of_rest", pose=pose, at_s=at_s, sigmas=sigmas))
 
 
 def worst_residuals(adjustment: Adjustment) -> list[float]:
@@ -116,15 +129,14 @@ def _scales(adjustment: Adjustment) -> Iterator[Judgement]:
         ratios = 1.0 / lengths if name == "gyro" else lengths
         for axis, ratio in zip("XYZ", ratios, strict=True):
             if abs(ratio - 1.0) > SCALE_LIMIT:
-                yield Judgement("bad", scale_text(f"{name} {axis} has {ratio:.3f} of its nominal scale"))
+                yield scale_judgement(name, axis, float(ratio))
 
 
-def scale_text(fault: str) -> str:
-    """Return the sentence on a scale that is far off."""
-    return (
-        f"{fault[0].upper()}{fault[1:]}, more than {SCALE_LIMIT:.0%} off: another profile, or a faulty "
-        "channel. No certificate is made."
-    )
+def scale_judgement(sensor: str, axis: str, ratio: float) -> Judgement:
+    """Return the sentence on a scale that is far off: of a ``gyro`` or an ``accelerometer``."""
+    if sensor == "gyro":
+        return Judgement("bad", message("gyro_scale_off", axis=axis, ratio=ratio, limit=SCALE_LIMIT))
+    return Judgement("bad", message("accelerometer_scale_off", axis=axis, ratio=ratio, limit=SCALE_LIMIT))
 
 
 def gravity_judgement(site: Site, sigma: float) -> Iterator[Judgement]:
@@ -132,9 +144,12 @@ def gravity_judgement(site: Site, sigma: float) -> Iterator[Judgement]:
     if site.gravity_m_s2 is None:
         yield Judgement(
             "note",
-            f"Gravity was not measured: normal gravity {site.gravity:.5f} m/s^2, to {sigma / 1e-5:.0f} mGal. "
-            f"All three scale factors K are in error by up to {sigma / site.gravity * 1e6:.0f} ppm, alike; "
-            "axes, biases and ratios of K are not.",
+            message(
+                "gravity_not_measured",
+                gravity_m_s2=site.gravity,
+                sigma_mgal=sigma / MGAL,
+                error_ppm=sigma / site.gravity / PPM,
+            ),
         )
 
 
@@ -148,9 +163,13 @@ def temperature_judgement(evidence: Evidence, is_free: bool) -> Iterator[Judgeme
     if span > TEMPERATURE_K:
         yield Judgement(
             "caution",
-            f"The temperature moved by {span:.1f} K and no slopes are estimated. At 0.005 deg/h, 5 ug and 5 "
-            f"ppm a kelvin that is {0.005 * span:.3f} deg/h, {5 * span:.0f} ug and {5 * span:.0f} ppm; use "
-            "--temperature.",
+            message(
+                "temperature_moved",
+                span_k=span,
+                bias_deg_per_h=0.005 * span,
+                bias_ug=5.0 * span,
+                scale_ppm=5.0 * span,
+            ),
         )
 
 
@@ -160,9 +179,13 @@ def earth_judgement(site: Site, earth: np.ndarray, sigmas: float) -> Judgement:
     latitude = degrees(np.arctan2(up, north))
     return Judgement(
         "caution",
-        f"The Earth rate is not that of the site, by {sigmas:.0f} sigma: the rests show a latitude of "
-        f"{latitude:.2f} deg and {np.hypot(north, up) / EARTH_RATE:.5f} of the Earth's rate, the site says "
-        f"{site.latitude_deg:.2f} deg; check the site. The measured rate is used.",
+        message(
+            "earth_rate_refuted",
+            sigmas=sigmas,
+            found_deg=latitude,
+            ratio=float(np.hypot(north, up)) / EARTH_RATE,
+            site_deg=site.latitude_deg,
+        ),
     )
 
 

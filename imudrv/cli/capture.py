@@ -8,6 +8,7 @@ from imudrv.capture import Capture
 from imudrv.cli.arguments import add_profile, message_stream
 from imudrv.terminal import BAD_INPUT, OK, say
 from imudrv.wire.layout import Layout, SequenceKind
+from imudrv.wording import counted
 
 
 def add_capture(parser: argparse.ArgumentParser) -> None:
@@ -42,7 +43,7 @@ def print_losses(capture: Capture, output: Path) -> int:
         where = "" if file.is_converted else f", at {first}{more}"
         say(f"  {name}: {rejected.runs} x, {rejected.length} in all{where}", stream)
     for channel, messages in list(capture.channels.items())[1:]:
-        say(f"  ignored: {messages} messages of channel {channel}", stream)
+        say(f"  ignored: {counted(messages, 'message')} of channel {channel}", stream)
     for hint in capture.hints:
         say(f"  hint: {hint}", stream)
     if fault := capture.sequence_fault:
@@ -53,7 +54,7 @@ def print_losses(capture: Capture, output: Path) -> int:
 
 def _unknown_gaps(count: int, layout: Layout) -> str:
     """Say how long the gaps may be whose length neither a counter nor a time of arrival gives."""
-    gaps = "1 gap of unknown length" if count == 1 else f"{count} gaps of unknown length"
+    gaps = f"{counted(count, 'gap')} of unknown length"
     if layout.sequence.kind is SequenceKind.NONE:
         return f"{gaps}: the unit sends no counter, and the capture has no times of arrival"
     return (

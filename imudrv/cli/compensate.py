@@ -13,6 +13,7 @@ from imudrv.files.tables import increment_columns, table
 from imudrv.imu.compensation import LEAVES_OUT_SKEW, Compensator
 from imudrv.imu.rate_filter import NAMES
 from imudrv.terminal import progress, say
+from imudrv.wording import counted
 
 EXAMPLE: Final = "z-up.raw --profile imu50-rs422 --calibration unit.yaml -o increments.npz"
 
@@ -58,8 +59,6 @@ def run(arguments: argparse.Namespace) -> int:
     say(f"  unit {calibration.serial_number}, {origin}", stream)
     if compensator.leaves_out_skew:
         say(f"  {LEAVES_OUT_SKEW}", stream)
-    say(
-        f"  size effect {size_effect}; rate filter {arguments.rate_filter}, delay {compensator.lag} samples",
-        stream,
-    )
+    delay = counted(compensator.lag, "sample")
+    say(f"  size effect {size_effect}; rate filter {arguments.rate_filter}, delay {delay}", stream)
     return code

@@ -19,6 +19,7 @@ from imudrv.sim.live import play
 from imudrv.sim.truth import true_calibration
 from imudrv.terminal import progress, say
 from imudrv.url import speed_of
+from imudrv.wording import counted
 
 EXAMPLE: Final = "rocking --profile imu50-rs422 --port pty --link /tmp/imu50"
 
@@ -70,7 +71,7 @@ def _record(arguments: argparse.Namespace) -> None:
     if arguments.truth is not None and not of_motion:
         write_calibration(arguments.truth, true_calibration(scenario, layout))
     say(
-        f"{arguments.output}: {samples} samples of {layout.name}, seed {scenario.seed}",
+        f"{arguments.output}: {counted(samples, 'sample')} of {layout.name}, seed {scenario.seed}",
         message_stream(arguments.output),
     )
 

@@ -7,6 +7,7 @@ from typing import Final
 from imudrv.compilation import can_keep, compile_all, remove_unused
 from imudrv.errors import InputError
 from imudrv.kernels import FOLDER
+from imudrv.wording import counted
 
 EXAMPLE: Final = ""
 
@@ -29,7 +30,7 @@ def run(arguments: argparse.Namespace) -> None:
             f"{FOLDER}: expected memory to compile kernels and space to keep them; free some, and repeat"
         )
     if made := len(_files(FOLDER) - before):
-        print(f"{FOLDER}: {made} kernels compiled")
+        print(f"{FOLDER}: {counted(made, 'kernel')} compiled")
     else:
         print(f"{FOLDER}: all kernels are compiled, nothing to do")
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from imudrv.diagnosis.traffic import TrafficSummary, decode_traffic
 from imudrv.profiles.schema import Profile
 from imudrv.records import Records
+from imudrv.wording import counted
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class Mismatch:
         if traffic.fits:
             return f"{frames} are right, but none continues the counter: {traffic.counts}"
         if self.profile.transport == "can":
-            return f"{traffic.syncs} messages with its identifiers, no complete sample"
+            return f"{counted(traffic.syncs, 'message')} with its identifiers, no complete sample"
         message = self.profile.messages[0]
         sync = f"sync {message.sync}"
         if not traffic.syncs:
@@ -43,7 +44,7 @@ class Mismatch:
             why = f"check right only {frames} x, as by chance"
         else:
             why = "check never right" if message.checks else "no complete frame"
-        return f"{sync} seen {traffic.syncs} times, {why}"
+        return f"{sync} seen {counted(traffic.syncs, 'time')}, {why}"
 
     def __str__(self) -> str:
         """What was found, and which profile it looks like."""

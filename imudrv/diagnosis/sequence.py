@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imudrv.imu.sequence import SampleCounts
+from imudrv.wording import counted
 
 _LEAST_FRAMES: Final = 10
 
@@ -32,7 +33,7 @@ def sequence_fault(counts: SampleCounts, gaps: int, counters: NDArray[np.int64])
         return ""
     found = (
         f"most of the {counts.frames} good frames do not continue the counter: {dropped} not output, "
-        f"{gaps} after a gap, {counts.restarts} restarts"
+        f"{gaps} after a gap, {counted(counts.restarts, 'restart')}"
     )
     steps, frequencies = np.unique(np.diff(counters), return_counts=True)
     if not len(steps) or 2 * frequencies.max() <= frequencies.sum():

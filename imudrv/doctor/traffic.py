@@ -9,6 +9,7 @@ from imudrv.doctor.verdict import Finding, Verdict
 from imudrv.ports.base import LineErrors
 from imudrv.profiles.line_load import line_load
 from imudrv.profiles.schema import Profile, SerialLine
+from imudrv.wording import counted
 
 _HEAVY_LOAD: Final = 0.9
 
@@ -54,7 +55,7 @@ def check_traffic(
         fix = "check cable, ground, termination and line settings; is this machine overloaded?"
         yield Finding("data", Verdict.FAIL, f"{found}; {counts}", fix)
     if counts.restarts:
-        found = f"it jumped back {counts.restarts} times"
+        found = f"it jumped back {counted(counts.restarts, 'time')}"
         yield Finding("counter", Verdict.WARN, found, "check the unit's power supply")
     rate_hz = diagnosis.rate(traffic, span_s)
     if in_real_time and abs(rate_hz / profile.rate_hz - 1.0) > diagnosis.RATE_TOLERANCE:

@@ -29,6 +29,7 @@ from imudrv.kernels import kernel
 from imudrv.records import FRAME, PULSES, Flag, Records
 from imudrv.wire.fields import ahead_of
 from imudrv.wire.layout import Layout, SequenceKind
+from imudrv.wording import counted
 
 WINDOW: Final = 64
 """A number less than this far behind the newest is out of order or duplicate; one up to this far ahead comes
@@ -77,8 +78,8 @@ class SampleCounts:
         invalid = f", {self.invalid_counter} with an invalid counter" if self.invalid_counter else ""
         recovered = f"; {self.recovered} of the lost recovered by running totals" if self.recovered else ""
         return (
-            f"{self.expected} samples by the counter = {self.good} good{where}"
-            f"; {self.duplicate} duplicate{invalid}, {self.restarts} restarts of the unit{recovered}"
+            f"{counted(self.expected, 'sample')} by the counter = {self.good} good{where}; {self.duplicate} "
+            f"duplicate{invalid}, {counted(self.restarts, 'restart')} of the unit{recovered}"
         )
 
 

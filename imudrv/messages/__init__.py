@@ -2,7 +2,7 @@
 
 import locale
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib import resources
 from typing import Final
@@ -11,6 +11,11 @@ import yaml
 
 LANGUAGES: Final = ("en", "zh_CN")
 """Languages with a catalogue; the first one is the default."""
+
+
+_PAGE: Final = "page_"
+_COMMAS: Final = frozenset(",，、")
+_SEMICOLONS: Final = frozenset(";；")
 
 
 def language(name: str | None = None) -> str:
@@ -42,6 +47,31 @@ def catalogue(language: str, package: str = __name__) -> Mapping[str, str]:
     content = resources.files(package).joinpath(f"{language}.yaml").read_bytes()
     texts: dict[str, str] = yaml.safe_load(content)
     return texts
+
+
+def page_labels(package: str = __name__) -> dict[str, dict[str, str]]:
+    """Return the labels of a page by language and by their names there, from the catalogues of a package."""
+    return {
+        name: {
+            key.removeprefix(_PAGE): text
+            for key, text in catalogue(name, package).items()
+            if key.startswith(_PAGE)
+        }
+        for name in LANGUAGES
+    }
+
+
+def joined(items: Iterable[str], language: str) -> str:
+    """Return the items of a list as one text in one of `LANGUAGES`, in which each item is seen as one.
+
+    They are separated by commas; by semicolons if an item contains a comma; numbered if one contains a
+    semicolon.
+    """
+    texts, items = catalogue(language), list(items)
+    marks = frozenset().union(*items) & (_COMMAS | _SEMICOLONS)
+    if len(items) > 1 and marks & _SEMICOLONS:
+        items = [texts["numbered"].format(number=k, item=item) for k, item in enumerate(items, 1)]
+    return texts["semicolon" if marks else "comma"].join(items)
 
 
 def named(texts: Mapping[str, str], kind: str, name: str) -> str:

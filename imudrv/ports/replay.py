@@ -29,6 +29,7 @@ from imudrv.units import NS
 from imudrv.url import Url, speed_of
 from imudrv.wire.candump import CandumpDecoder
 from imudrv.wire.layout import Layout
+from imudrv.wording import counted
 
 _CHUNK_BYTES: Final = 1 << 16
 _STEP_NS: Final = 1_000_000
@@ -176,7 +177,7 @@ def _log(path: Path, layout: Layout, step_ns: int | None, channel: str | None) -
     if not found:
         raise InputError(
             f"{path}: expected a candump log for the CAN profile {layout.name}, "
-            f"got {decoder.bytes_fed} bytes without one message"
+            f"got {counted(decoder.bytes_fed, 'byte')} without one message"
         )
 
 

@@ -15,6 +15,7 @@ from imudrv.files.inputs import open_file
 from imudrv.recording.reader import Recording
 from imudrv.records import INCREMENTS, Flag, Records
 from imudrv.wire.datagram import DatagramDecoder
+from imudrv.wording import counted
 
 _CHUNK_BYTES: Final = 76 << 12
 _COUNTERS: Final = 1 << 32
@@ -45,7 +46,7 @@ class Counts:
     def __str__(self) -> str:
         """One-line summary."""
         return (
-            f"{self.samples} samples, {self.bridged} more bridged by long intervals; "
+            f"{counted(self.samples, 'sample')}, {self.bridged} more bridged by long intervals; "
             f"{self.invalid} not valid, {self.left_out} lost and left out"
         )
 

@@ -16,6 +16,7 @@ from imudrv.service.latency import LatencyReport
 from imudrv.service.status_socket import FORMAT, VERSION
 from imudrv.sinks.base import SinkState
 from imudrv.wire.layout import Layout
+from imudrv.wording import Count
 
 
 @dataclass(frozen=True)
@@ -216,7 +217,7 @@ class Status:
         if self.port.users:
             yield texts["reason_users"].format(programs=", ".join(self.port.users))
         if self.samples.lost_last_s:
-            yield texts["reason_lost"].format(samples=self.samples.lost_last_s)
+            yield texts["reason_lost"].format(samples=Count(self.samples.lost_last_s))
         if self.port.state == "streaming" and not self.clock.locked:
             yield texts["reason_clock"]
         yield from self.notices

@@ -12,8 +12,8 @@ from typing import Any, Final
 import numpy as np
 
 from imudrv.errors import InputError
-from imudrv.messages import LANGUAGES, catalogue
-from imudrv.service.monitor import rows
+from imudrv.messages import LANGUAGES, page_labels
+from imudrv.service.monitor import problems, rows
 from imudrv.service.status import Status
 from imudrv.service.status_socket import ask
 from imudrv.units import DEG, NS
@@ -24,10 +24,6 @@ ADDRESS: Final = "127.0.0.1:8651"
 
 PERIOD_S: Final = 0.25
 """Interval of the frames, s."""
-
-
-_PREFIX: Final = "page_"
-"""Beginning of the keys of labels."""
 
 
 def serve(path: Path, address: str, say: Callable[[str], None], language: str) -> None:
@@ -51,10 +47,8 @@ def serve(path: Path, address: str, say: Callable[[str], None], language: str) -
     """
     ask(path)
     page = resources.files(__package__).joinpath("page")
-    files = {file.name: file for file in page.iterdir() if file.is_file()}
-    with closing(PageServer(files, address, secrets.token_urlsafe(16), lambda _: None)) as server:
-        labels = {name: _labels(name) for name in LANGUAGES}
-        server.keep("hello", json.dumps({"kind": "hello", "language": language, "labels": labels}))
+    with closing(PageServer(page, address, secrets.token_urlsafe(16), lambda _: None)) as server:
+        server.keep("hello", json.dumps({"kind": "hello", "language": language, "labels": page_labels()}))
         say(f"page for browsers: {server.url}")
         while True:
             if server.viewers:
@@ -73,12 +67,6 @@ def octaves(histogram: Sequence[tuple[int, int]]) -> list[tuple[float, int]]:
     return [((1 << k) * 1e-3, counts.get(k, 0)) for k in range(min(counts), max(counts) + 1)]
 
 
-def _labels(language: str) -> dict[str, str]:
-    """Return the labels of the page by their names there."""
-    texts = catalogue(language)
-    return {key.removeprefix(_PREFIX): texts[key] for key in texts if key.startswith(_PREFIX)}
-
-
 def _frame(path: Path) -> dict[str, Any]:
     try:
         status = Status.from_json(ask(path))
@@ -88,7 +76,7 @@ def _frame(path: Path) -> dict[str, Any]:
     return {
         "kind": "status",
         "health": status.health,
-        "reasons": {name: status.reasons(name) for name in LANGUAGES},
+        "problems": {name: problems(status, name) for name in LANGUAGES},
         "rows": {name: list(rows(status, name)) for name in LANGUAGES},
         "latency": octaves(status.latency.histogram),
         "rate": float(np.linalg.norm(last.dtheta_b)) / seconds / DEG,

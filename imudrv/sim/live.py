@@ -26,6 +26,7 @@ from imudrv.sim.scenario import Scenario, samples
 from imudrv.sim.unit import More
 from imudrv.units import NS
 from imudrv.wire.layout import Layout
+from imudrv.wording import counted
 
 AHEAD: Final = 1000
 """Samples simulated at a time, ahead of playback; 4 ms of work, so the first are ready soon."""
@@ -182,7 +183,8 @@ class Played:
     def __str__(self) -> str:
         """One-line summary."""
         late = "" if self.latest_ns is None else f"; {self.latest_ns * 1e-6:.2f} ms late at worst"
-        return f"{self.samples} samples, {self.sent} {self.unit}, {self.undelivered} not delivered{late}"
+        samples = counted(self.samples, "sample")
+        return f"{samples}, {self.sent} {self.unit}, {self.undelivered} not delivered{late}"
 
 
 def play(

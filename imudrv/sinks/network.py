@@ -13,6 +13,7 @@ from imudrv.sinks.backlog import Backlog
 from imudrv.sinks.base import HOUSEKEEPING_NS, Batch, Outlet, Sink, SinkState, Written
 from imudrv.url import host_and_port, split
 from imudrv.wire.datagram import SIZE
+from imudrv.wording import counted
 
 MAX_CLIENTS: Final = 32
 STALLED_S: Final = 5.0
@@ -264,7 +265,7 @@ class TcpSink(Sink):
     def state(self) -> SinkState:
         """Current state."""
         count = len(self._clients)
-        clients = "1 client" if count == 1 else f"{count} clients" if count else "waiting for a client"
+        clients = counted(count, "client") if count else "waiting for a client"
         stalled = f"; {self._stalled} disconnected that took nothing for {STALLED_S:g} s"
         counts = [client.backlog for client in self._clients]
         return SinkState(

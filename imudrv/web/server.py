@@ -13,6 +13,7 @@ import json
 import secrets
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from importlib import resources
 from importlib.resources.abc import Traversable
 from threading import Event, Thread
 from typing import TYPE_CHECKING, Any, Final
@@ -61,8 +62,8 @@ class PageServer:
 
     Parameters
     ----------
-    files : Mapping of str to Traversable
-        Files of the page by name; ``index.html`` is the page.
+    page : Traversable
+        Folder with the files of the page; ``index.html`` is the page. All pages have ``live.js``, too.
     address : str
         ``HOST:PORT``.
     token : str
@@ -85,7 +86,7 @@ class PageServer:
 
     def __init__(
         self,
-        files: Mapping[str, Traversable],
+        page: Traversable,
         address: str,
         token: str,
         receive: Callable[[dict[str, Any]], None],
@@ -95,7 +96,8 @@ class PageServer:
             import aiohttp  # noqa: F401
         except ImportError:
             raise InputError("--web: expected the package aiohttp: pip install 'imu50[web]'") from None
-        self._files = {name: file.read_bytes() for name, file in files.items()}
+        files = (resources.files(__package__).joinpath("live.js"), *page.iterdir())
+        self._files = {file.name: file.read_bytes() for file in files if file.is_file()}
         self._documents = dict(documents or {})
         self._token, self._receive = token, receive
         self._viewers: dict[Any, _Viewer] = {}

@@ -185,9 +185,12 @@ def test_the_operator_sees_every_step_and_the_result(
     assert said.index("rms error of the nine components") > said.index("active certificate")
 
 
-def test_a_rehearsal_in_fast_time_is_not_reported_as_a_wrong_rate(undisturbed: tuple[Path, str]) -> None:
+def test_a_rehearsal_in_fast_time_is_reported_neither_as_a_wrong_rate_nor_without_data(
+    undisturbed: tuple[Path, str],
+) -> None:
     folder, said = undisturbed
     assert "samples/s" not in said + (folder / JOURNAL).read_text()
+    assert "NO DATA" not in said
 
 
 @pytest.mark.parametrize(

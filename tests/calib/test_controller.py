@@ -283,16 +283,27 @@ def test_messages_of_the_service_about_the_port_are_shown_and_journaled(
 ) -> None:
     monkeypatch.setattr(controllers, "REDRAW_S", 0.0)
     lost = "port lost: the other end has gone"
-    states = [LineState("streaming")] * 20 + [LineState("lost", "the other end has gone")] * 20
-    _, text = conducted(session, [*batches[:50], lost, *batches[50:60]], port_states=states)
+    states = [LineState("streaming")] * 51 + [LineState("lost", "the other end has gone")]
+    _, text = conducted(session, [*batches[:50], lost], port_states=states)
     assert f"! {lost}" in text
     assert [entry.text for entry in session.entries if isinstance(entry, ServiceMessage)] == [lost]
     assert "!" not in text.splitlines()[-1]
 
 
-def test_nothing_is_accepted_while_the_rate_of_the_unit_is_not_that_of_its_profile(
-    session: Session, batches: list[Batch]
+def test_a_line_that_has_ended_is_no_fault_while_its_samples_wait(
+    session: Session, batches: list[Batch], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(controllers, "REDRAW_S", 0.0)
+    ended = LineState("lost", "the simulated unit has ended")
+    _, text = conducted(session, list(batches), port_states=[LineState("streaming"), *[ended] * 9999])
+    assert "GOOD: STEP 1 OF 1 DONE" in text
+    assert "NO DATA" not in text
+
+
+def test_nothing_is_accepted_while_the_rate_of_the_unit_is_not_that_of_its_profile(
+    session: Session, batches: list[Batch], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(controllers, "REDRAW_S", 0.0)
     wrong = LineState("wrong rate", "expected 1000 samples/s, the unit counts 500.0")
     _, text = conducted(session, [*batches], port_states=[wrong] * 10 * len(batches))
     assert "preflight: WRONG RATE: CHECK THE PROFILE | " in text

@@ -1,6 +1,5 @@
 """Allan deviations against published numbers and another program; their coefficients; `calib noise`."""
 
-import importlib.util
 import json
 from itertools import pairwise
 from pathlib import Path
@@ -27,12 +26,12 @@ from imudrv.sinks.recorder import Recorder
 from imudrv.units import ARCSEC, DEG_PER_SQRT_H, UG
 from imudrv.wire.datagram import encode
 from imudrv.wire.encode import StreamEncoder
+from tools import psins_to_wire
 
 Array = NDArray[np.float64]
 LAYOUT = profiles.load("imu50-rs422").layout()
 TAU = 1e-3
 ARW, VRW = 0.5 * DEG_PER_SQRT_H, 3000.0 * UG  # a pulse a sample or more: the error of the count is white
-TOOLS = Path(__file__).parents[2] / "tools"
 
 
 def kept(n: int) -> NDArray[np.int8]:
@@ -175,7 +174,7 @@ def test_a_line_is_not_described_by_the_model() -> None:
     assert not found.is_accepted
 
 
-def pulses(duration_s: float, seed: int = 1, rate: float = 0.0, **flags: int) -> Records:
+def pulses(duration_s: float, seed: int = 1, rate: float = 0.0, walk: float = VRW) -> Records:
     """Pulses of a unit with white noise, Z up; `rate`: about Z, rad/s, in the middle second of each ten."""
     n = round(duration_s / TAU)
     rng = np.random.default_rng(seed)
@@ -188,7 +187,7 @@ def pulses(duration_s: float, seed: int = 1, rate: float = 0.0, **flags: int) ->
     moving = (np.arange(n) // 1000) % 10 == 5
     angle[:, 2] += np.cumsum(rate * TAU * moving)
     velocity = np.cumsum(
-        VRW * TAU**0.5 * rng.normal(size=(n, 3)) + np.array([0.01, -0.02, 9.8]) * TAU, axis=0
+        walk * TAU**0.5 * rng.normal(size=(n, 3)) + np.array([0.01, -0.02, 9.8]) * TAU, axis=0
     )
     samples["gyro"] = np.diff(np.floor(angle / (0.5 * ARCSEC)), axis=0, prepend=0.0)
     samples["accelerometer"] = np.diff(np.floor(velocity * 2000.0), axis=0, prepend=0.0)
@@ -354,6 +353,25 @@ def test_a_gap_each_minute_pools_the_stretches_between(
     assert 60.0 / 8.0 / 1.2 < document["channels"][0]["fitted_tau_s"][1] <= 60.0 / 8.0
 
 
+@pytest.mark.parametrize(("swing", "words"), [(0.0, "pulses come too regularly"), (4.0, "vibration")])
+def test_regular_pulses_are_told_from_a_vibration(
+    tmp_path: Path, swing: float, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    samples = pulses(60.0, walk=5.0 * UG)  # a pulse of 50 ug s: two minutes of noise
+    beside = swing * np.sin(2.0 * np.pi * 3.1 * np.arange(len(samples)) * TAU)
+    samples["accelerometer"] += np.diff(np.rint(beside), prepend=0.0).astype(np.int64)[:, None]
+    write(tmp_path / "rest.raw", samples)
+    assert noise(tmp_path / "rest.raw", "--profile", "imu50-rs422", "--json", tmp_path / "n.json") == 0
+    (said,) = [
+        one
+        for one in json.loads((tmp_path / "n.json").read_text())["verdicts"]
+        if one["reason"].startswith("accelerometer X, accelerometer Y, accelerometer Z: ")
+    ]
+    assert words in said["reason"]
+    assert said["verdict"] == ("caution" if swing else "note")
+    assert "UPPER LIMITS" in capsys.readouterr().out
+
+
 def test_a_moving_unit_is_refused_with_upper_limits(
     tmp_path: Path, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -424,24 +442,38 @@ def test_a_signed_certificate_is_not_copied_with_its_signature(folder: Path) -> 
     assert read_calibration(folder / "copy.yaml").signature is None
 
 
-@pytest.mark.parametrize("window", [(600, 960), (1020, 1500)])
+PARKED = pytest.mark.parametrize("window", [(600, 960), (1020, 1500)])
+"""Where the laser-gyro unit in its car was quietest, s."""
+
+
+@PARKED
 def test_a_parked_car_is_not_at_rest(
     data: Path, tmp_path: Path, window: tuple[int, int], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    spec = importlib.util.spec_from_file_location("psins_to_wire", TOOLS / "psins_to_wire.py")
-    assert spec is not None
-    assert spec.loader is not None
-    psins_to_wire = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(psins_to_wire)
     raw, document = tmp_path / "car.raw", tmp_path / "n.json"
     psins_to_wire.convert(data / "lasergyro.imu", raw)
     times = ("--from", str(window[0]), "--to", str(window[1]))
     assert noise(raw, "--profile", psins_to_wire.PROFILE, *times, "--json", document) == 3
     assert "not the noise of a unit at rest" in capsys.readouterr().out
-    channels = json.loads(document.read_text())["channels"]
-    limits = [one["upper_limits"]["angle_random_walk_deg_per_sqrt_h"]["value"] for one in channels[:3]]
+    found = json.loads(document.read_text())
+    walks = [one["upper_limits"]["angle_random_walk_deg_per_sqrt_h"] for one in found["channels"][:3]]
     # a unit of this class has some 0.005 deg/sqrt(h); the car shakes it ten times as much at most
-    assert 0.005 < min(limits) < max(limits) < 0.05
+    assert all(0.005 < walk["estimate"] < walk["value"] < 0.05 for walk in walks)
+    vertical = found["channels"][5]
+    walk = vertical["upper_limits"]["velocity_random_walk_ug_per_sqrt_hz"]
+    deviation = vertical["allan_deviation_si"][found["tau_s"].index(walk["tau_s"])]
+    assert walk["estimate"] == pytest.approx(deviation * walk["tau_s"] ** 0.5 / UG)
+
+
+@PARKED
+def test_a_parked_car_has_the_known_random_walks_at_most(data: Path, window: tuple[int, int]) -> None:
+    # the smallest sigma sqrt(tau) of the whole window, motion included, up to an eighth of its length
+    rows = psins_to_wire.read(data / "lasergyro.imu")[100 * window[0] : 100 * window[1]]
+    found = allan(np.concatenate([rows["gyro"] * 0.1, rows["accelerometer"] * 125.0], axis=1))
+    found = found.part(found.factors <= len(rows) / 8)
+    walks = np.sqrt((found.variance * found.factors[:, None] / 0.01).min(axis=0))
+    assert walks[:3].max() / 60.0 <= 0.045  # arcsec/sqrt(s) to deg/sqrt(h)
+    assert walks[5] <= 46.0
 
 
 def test_coefficients_of_a_sensor_are_three_numbers_or_absent() -> None:

@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calib.cli import main
 from calib.procedure.plan import duration_s, load, predicted, shipped, text, verification
 from calib.procedure.schema import Procedure
 from calib.sensors import plan as sensors_plan
@@ -260,6 +261,14 @@ def test_a_plan_shows_what_is_to_be_done_how_long_it_takes_and_how_accurate_it_i
     assert f"{worst:.4f}" in shown
 
 
+def test_the_plan_of_too_few_rotations_says_what_to_add(site: Site) -> None:
+    shown = text(procedure({"id": "z-up", "up": "+Z", "east": "+X", "turn_deg": 180}), site)
+
+    assert shown.startswith("test: 1 rotation, about ")
+    assert "  z-up: Z up, X east; " in shown
+    assert shown.endswith("does not determine the six differences of the sensing points; add: X up and Y up")
+
+
 def test_ten_turns_are_three_times_as_accurate_as_three_rotations(site: Site) -> None:
     three, ten = (predicted(load(name), site).differences_sigma for name in ("three-rotations", "ten-turns"))
 
@@ -267,11 +276,23 @@ def test_ten_turns_are_three_times_as_accurate_as_three_rotations(site: Site) ->
 
 
 def test_the_plan_of_the_sensors_shows_what_is_observable(site: Site) -> None:
-    shown = sensors_plan.text(load("six-faces-turned"), site)
+    shown, measured = (
+        sensors_plan.text(load("six-faces-turned"), site.model_copy(update={"gravity_m_s2": gravity}))
+        for gravity in (None, 9.7917)
+    )
 
     assert shown.startswith("six-faces-turned: 12 rests, about 13 min\n")
     assert "rank 31 of 31" in shown
     assert "not observable" not in shown
+    assert "All three scale factors K are in error by up to 51 ppm" in shown
+    assert "Gravity" not in measured
+
+
+def test_the_plan_of_a_long_rest_has_its_averaging_times(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "--plan", "--procedure", "long-rest", "--rehearse"]) == 0
+    shown = capsys.readouterr().out
+    assert shown.startswith("long-rest: 1 rest, about 240 min\n")
+    assert "averaging times up to 1800 s" in shown
 
 
 def test_the_plan_of_poor_motions_names_what_they_lack_and_what_would_show_it(site: Site) -> None:

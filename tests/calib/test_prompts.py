@@ -47,7 +47,7 @@ def test_the_code_and_every_catalogue_have_the_same_keys_with_the_same_values(la
     texts = catalogue(language)
     calls = list(used())
 
-    assert {key for key, _ in calls} | {"separator"} | on_the_page() == set(texts)
+    assert {key for key, _ in calls} | on_the_page() == set(texts)
     for key, names in calls:
         assert placeholders(texts[key]) == names, key
 
@@ -105,8 +105,13 @@ def test_values_are_formatted_and_messages_within_a_message_are_rendered() -> No
         message("accelerometer_reads", axis=axis, measured_m_s2=1.0, expected_m_s2=-9.8) for axis in "XY"
     )
     assert english(message("axis_fault", readings=readings, cause=message("unexplained"))).startswith(
-        "accelerometer X reads +1.00 m/s^2, expected -9.80, accelerometer Y reads +1.00 m/s^2, "
+        "accelerometer X reads +1.00 m/s^2, expected -9.80; accelerometer Y reads +1.00 m/s^2, "
     )
+
+
+@pytest.mark.parametrize(("n", "shown"), [(1, "1 rest, about 31 min"), (12, "12 rests, about 31 min")])
+def test_a_noun_has_the_number_of_its_count(n: int, shown: str) -> None:
+    assert english(message("expected_rests", folder="s", rests=n, minutes=31.0)) == f"session s: {shown}"
 
 
 def test_text_from_elsewhere_is_shown_as_it_is() -> None:

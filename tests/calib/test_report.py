@@ -179,7 +179,7 @@ def test_every_rotation_has_a_verdict_or_a_reason_for_rejection(
 ) -> None:
     text = " ".join(as_text(document(identification, arms)).split())
     assert text.count("deg off the vertical; then") == 3
-    assert text.count("turned 30.0 deg, want 180 +- 5") == 3
+    assert text.count("turned 30.0 deg, expected 180 +- 5") == 3
 
 
 def marks_of(identification: IdentificationResult, **changes: object) -> list[tuple[str, str]]:
@@ -234,7 +234,7 @@ def test_three_rotations_are_noted_as_not_checked(identification: Identification
     assert "agreement" not in text
     notes = " ".join(text for mark, text in marks if mark == "note")
     assert "Arms determined, not checked: no redundant rotation" in notes
-    assert "include one of 0.5 ms" in notes
+    assert "include a skew of 0.5 ms" in notes
 
 
 @pytest.mark.parametrize(("p_shift", "level"), [(2.0, "good"), (20.0, "caution")])

@@ -136,7 +136,7 @@ def test_bars_figures_and_reasons_are_on_the_screen() -> None:
                 remaining_s=75.0,
                 level_sigma_deg=0.0031,
                 heading_sigma_deg=0.0821,
-                reasons=("turned 148.3 deg, want 180 +- 5",),
+                reasons=("turned 148.3 deg, expected 180 +- 5",),
             )
         )
     )
@@ -146,7 +146,7 @@ def test_bars_figures_and_reasons_are_on_the_screen() -> None:
         "44 deg/s",
         "moving",
         "level 0.0031 deg, heading 0.0821 deg",
-        "turned 148.3 deg, want 180 +- 5",
+        "turned 148.3 deg, expected 180 +- 5",
         "Enter: confirm   r: redo   s: skip   b: back to the skipped step   q: abort",
     ):
         assert words in text
@@ -256,12 +256,12 @@ def test_without_a_terminal_each_change_is_a_line() -> None:
     shown = OperatorScreen(Console(file=out, width=80))
     shown.show(view(rate_deg_per_s=20.0, hints=("roll it over",)))
     shown.show(view(rate_deg_per_s=30.0, hints=("roll it over",), bells=1))
-    shown.show(view(Phase.VERDICT, "REJECTED: DO IT AGAIN", reasons=("turned 150.0 deg, want 180 +- 5",)))
+    shown.show(view(Phase.VERDICT, "REJECTED: DO IT AGAIN", reasons=("turned 150 deg, expected 180 +- 5",)))
     shown.show(view(Phase.VERDICT, "REJECTED: DO IT AGAIN"), question=verbatim("once more: abort"))
     shown.close()
     assert out.getvalue().splitlines() == [
         "step 2 of 3: X up, +180 deg | place: TURN IT: X UP | roll it over",
-        "step 2 of 3: X up, +180 deg | verdict: REJECTED: DO IT AGAIN | ! turned 150.0 deg, want 180 +- 5",
+        "step 2 of 3: X up, +180 deg | verdict: REJECTED: DO IT AGAIN | ! turned 150 deg, expected 180 +- 5",
         "step 2 of 3: X up, +180 deg | verdict: REJECTED: DO IT AGAIN | ! once more: abort",
     ]
 

@@ -120,16 +120,16 @@ def test_a_long_rest_counts_as_several_and_a_long_motion_as_one(
 @pytest.mark.parametrize(
     ("steps", "reason"),
     [
-        ([(40.0,), (2.5, 171.2), (8.0,)], "turned 171.2 deg, want 180 +- 5"),
-        ([(40.0,), (7.0, 180.0), (8.0,)], "peak 48 deg/s: slower than 60, expect 3.2 mm"),
+        ([(40.0,), (2.5, 171.2), (8.0,)], "turned 171.2 deg, expected 180 +- 5"),
+        ([(40.0,), (7.0, 180.0), (8.0,)], "peak 48 deg/s: slower than 60, an error of about 3.2 mm"),
         (
             [(40.0,), (2.5, 180.0, (0.3, 0.0, 1.0)), (8.0,)],
-            "axis 16.7 deg off the vertical, want at most 10",
+            "axis 16.7 deg off the vertical, expected at most 10",
         ),
-        ([(20.0,), (2.5, 180.0), (8.0,)], "rest before 20.0 s, want 32"),
-        ([(40.0,), (2.5, 180.0), (2.5,)], "rest after 2.5 s, want 2.8"),
-        ([(2.5, 180.0), (8.0,)], "no rest before it, want 32 s"),
-        ([(40.0,), (2.5, 180.0)], "no rest after it, want 2.8 s"),
+        ([(20.0,), (2.5, 180.0), (8.0,)], "rest before 20.0 s, expected 32"),
+        ([(40.0,), (2.5, 180.0), (2.5,)], "rest after 2.5 s, expected 2.8"),
+        ([(2.5, 180.0), (8.0,)], "no rest before it, expected 32 s"),
+        ([(40.0,), (2.5, 180.0)], "no rest after it, expected 2.8 s"),
     ],
 )
 def test_each_rejection_has_its_number_and_its_limit(
@@ -142,7 +142,7 @@ def test_each_rejection_has_its_number_and_its_limit(
 def test_another_axis_than_that_of_the_procedure_is_reported(bench: Bench, step: Step) -> None:
     rotation = only(find_segments([bench(step(40.0), step(2.5, 180.0), step(8.0), up="+Y")]))
     assert rejection_reasons(rotation, LIMITS, expected="Y") == ()
-    assert rejection_reasons(rotation, LIMITS, expected="Z") == ("about Y, expected Z",)
+    assert rejection_reasons(rotation, LIMITS, expected="Z") == ("turned about Y, expected about Z",)
 
 
 def test_missing_samples_and_flags_in_the_rotation_are_reported(bench: Bench, step: Step) -> None:
@@ -152,7 +152,7 @@ def test_missing_samples_and_flags_in_the_rotation_are_reported(bench: Bench, st
     kept["flags"][turning + 5] |= Flag.SATURATED
     kept["flags"][turning + 6] |= Flag.FAULT
     assert rejection_reasons(only(find_segments([kept])), LIMITS) == (
-        "3 samples missing during the rotation, want at most 0",
+        "3 samples missing during the rotation, expected at most 0",
         "an axis saturated during the rotation",
         "the unit reported a fault during the rotation",
     )
@@ -176,8 +176,8 @@ def test_a_bump_ends_a_rest_and_is_no_rotation(bench: Bench, step: Step) -> None
         step(8.0),
     )
     bump, rotation = find_segments([bumped]).rotations
-    assert "turned 0.0 deg, want 180 +- 5" in rejection_reasons(bump, LIMITS)
-    assert rejection_reasons(rotation, LIMITS) == ("rest before 25.0 s, want 32",)
+    assert "turned 0.0 deg, expected 180 +- 5" in rejection_reasons(bump, LIMITS)
+    assert rejection_reasons(rotation, LIMITS) == ("rest before 25.0 s, expected 32",)
 
 
 def test_a_shift_that_gyros_do_not_feel_ends_a_rest_too(bench: Bench, step: Step) -> None:
@@ -196,8 +196,8 @@ def test_two_pushes_with_a_short_pause_are_one_rotation(bench: Bench, step: Step
 def test_two_pushes_with_a_rest_between_are_both_rejected(bench: Bench, step: Step) -> None:
     data = bench(step(40.0), step(1.3, 90.0), step(2.0), step(1.3, 90.0), step(8.0))
     first, second = (rejection_reasons(r, LIMITS) for r in find_segments([data]).rotations)
-    assert first == ("turned 90.0 deg, want 180 +- 5", "rest after 2.0 s, want 2.8")
-    assert second == ("turned 90.0 deg, want 180 +- 5", "rest before 2.0 s, want 32")
+    assert first == ("turned 90.0 deg, expected 180 +- 5", "rest after 2.0 s, expected 2.8")
+    assert second == ("turned 90.0 deg, expected 180 +- 5", "rest before 2.0 s, expected 32")
 
 
 def test_placing_the_unit_between_rotations_is_no_rotation(bench: Bench, step: Step) -> None:

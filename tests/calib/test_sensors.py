@@ -12,6 +12,7 @@ import pytest
 from calib.cli import main
 from calib.detection.rest_bins import Noise
 from calib.estimation.dither_line import DitherLine
+from calib.messages import text
 from calib.procedure.plan import load as load_procedure
 from calib.procedure.schema import Procedure
 from calib.sensors.adjustment import Free, Wander, _wander, _whole_basis, covariance_of
@@ -44,6 +45,7 @@ from tools.sensors_units import (
     new_unit,
     pulses_of,
     six_faces_turned,
+    three_loops,
     write_session,
 )
 
@@ -73,7 +75,9 @@ Solve = Callable[..., SensorsResult]
 
 @pytest.fixture
 def solve(tmp_path: Path) -> Solve:
-    def solve(*pieces: Records, site=SITE, start=None, captures=None, **options) -> SensorsResult:
+    def solve(
+        *pieces: Records, site=SITE, start=None, captures=None, profile=PROFILE, **options
+    ) -> SensorsResult:
         paths = []
         for k, pulses in enumerate(pieces):
             path = tmp_path / f"session-{k}.raw"
@@ -83,7 +87,7 @@ def solve(tmp_path: Path) -> Solve:
             captures or paths,
             site=site,
             unit=UNIT,
-            profile=PROFILE,
+            profile=profile,
             start=start,
             options=SensorsOptions(**options),
         )
@@ -280,7 +284,10 @@ def test_slopes_per_kelvin_are_found_while_the_unit_warms_up(solve):
     written = certificate(found).temperature
     end = 20.0 + 50.0 / 3600e9 * pulses["elapsed_ns"][-1]
     assert written.range_degc == pytest.approx((20.0, end), abs=0.3)  # what was measured, no more
-    assert "temperature moved by" in texts(solve(pulses), "caution")
+    said = texts(solve(pulses), "caution")
+    # 24 rests of 24 s and their motions: 50 K/h for 12 min
+    assert re.search(r"The temperature moved by (9|1\d)\.\d K and no slopes are estimated", said)
+    assert re.search(r"that is 0\.0\d+ deg/h, \d\d ug and \d\d ppm; use --temperature", said)
 
 
 def test_in_a_steady_room_no_slope_is_certified(solve, session):
@@ -321,12 +328,42 @@ def test_six_faces_as_six_files_give_what_they_show_and_say_what_to_add(solve, s
     assert "gyro.scale_arcsec_per_pulse[0]" not in kept.sensors.covariance.names
 
 
-def test_faces_missing_name_the_terms_of_their_axis(solve, session):
-    found = solve(pieces(session, 0, 6))  # nothing but +X was up beside Z
-    lacking = set(found.not_observable)
-    assert "accelerometer.quadratic_ug_per_g2[1]" in lacking
-    assert not lacking & {"accelerometer.scale_pulse_per_m_s[2]", "gyro.scale_arcsec_per_pulse[0]"}
-    assert any("accelerometer.quadratic_ug_per_g2" in text for text in found.missing)
+def test_a_face_missing_names_what_its_axis_is_known_to(solve, session, unit):
+    found = solve(pieces(session, 0, 10))  # without -Y
+    assert found.mark == "note"
+    said = re.fullmatch(
+        r"Without a rest with -Y up, accelerometer Y is known to (\d+) ppm in its scale factor, "
+        r"(\d+) ug/g\^2 in the quadratic term\.",
+        texts(found, "note"),
+    )
+    assert said
+    value, truth = {one.path: one for one in found.estimates}, true_numbers(unit)
+    for size, path, scale in zip(
+        said.groups(),
+        ("accelerometer.scale_pulse_per_m_s[1]", "accelerometer.quadratic_ug_per_g2[1]"),
+        (2000e-6, 1.0),
+        strict=True,
+    ):
+        assert value[path].sigma == pytest.approx(float(size) * scale, rel=0.05)
+        assert abs(value[path].value - truth[path]) < 4.0 * value[path].sigma
+
+
+def test_one_loop_names_what_is_missing_and_the_loop_that_shows_it(solve):
+    found = solve(sessions(new_unit(7, LAYOUT, three_loops()[:5], rest_s=REST_S)))  # about X
+    assert found.mark == "note"
+    assert set(found.not_observable) == {
+        "gyro.C_bg[2][1]",
+        "accelerometer.C_ba[1][0]",
+        "accelerometer.quadratic_ug_per_g2[0]",
+    }
+    said = texts(found, "note")
+    assert "Not observable, and kept at the start or left out: gyro.C_bg[2][1]" in said
+    assert re.search(
+        r"Without a rest with \+X, -X up, accelerometer X is known to \d+ ppm in its scale factor\.", said
+    )
+    (text,) = found.missing
+    assert "four quarter turns about Y" in text
+    assert "accelerometer.quadratic_ug_per_g2[0]" in text
 
 
 def pieces(session: Records, first: int, stop: int) -> Records:
@@ -359,7 +396,7 @@ def test_a_wander_that_few_residuals_show_counts_for_more_than_its_likely_size(r
     Z = _whole_basis(Free(), len(found.attitudes))
     root = np.linalg.cholesky(covariance_of(found.system, Wander(0.0, 5.0 * UG)))
     draws = (replace(found.system, residual=root @ rng.standard_normal(len(root))) for _ in range(60))
-    sizes = [_wander(one, Z, found.p, found.p.gravity, 1e-5).accelerometer / UG for one in draws]
+    sizes = [_wander(one, Z, found.p, 1e-5).accelerometer / UG for one in draws]
     # 8 degrees of freedom: 5 ug sqrt(8 / 6) = 5.8, known to 4 % from 60 draws
     assert 5.1 < np.sqrt(np.mean(np.square(sizes))) < 6.5
 
@@ -577,7 +614,7 @@ def test_saturated_samples_cost_the_rest_or_the_motion(solve, session, at_rest, 
     spoilt["status"][at : at + 5] |= 1 << 10
     found = solve(spoilt)
     assert what in [one.what for one in found.evidence.left]
-    assert all("5 samples are saturated or faulted" in one.reason for one in found.evidence.left)
+    assert all("5 saturated or faulted samples" in one.reason for one in found.evidence.left)
     assert len(found.evidence.rests) == (11 if at_rest else 12)
     assert len(found.evidence.links) == (9 if at_rest else 10)
 
@@ -637,6 +674,20 @@ def test_a_scale_far_off_nominal_is_named_with_its_ratio(solve, session, sensor,
     assert any(re.search(words, one.text) for one in found.verdict)
 
 
+def test_the_scales_of_another_profile_are_named(solve, session):
+    other = PROFILE.nominal.model_copy(update={"accelerometer_pulse_per_m_s": 1000.0})
+    said = texts(solve(session, profile=PROFILE.model_copy(update={"nominal": other})), "bad")
+    for axis in "XYZ":
+        assert re.search(rf"Accelerometer {axis} has (1\.9|2\.0)\d\d of its nominal scale", said)
+    assert "more than 20% off: another profile, or a faulty channel" in said
+
+
+def test_the_verdict_follows_the_language(result):
+    chinese = [text(one.what, "zh_CN") for one in result.verdict]
+    assert any("个静止段、" in sentence for sentence in chinese)
+    assert not any(re.search("[a-z]{3,} [a-z]{2,}", sentence) for sentence in chinese)
+
+
 def test_without_measured_gravity_the_scales_are_uncertain_alike(solve, session, result):
     found = solve(session, site=SITE.model_copy(update={"gravity_m_s2": None}))
     assert found.mark == "note"
@@ -667,8 +718,9 @@ def test_the_latitude_of_the_other_hemisphere_is_refused(solve, session):
 
 def test_compensated_increments_are_refused(solve, tmp_path):
     path = tmp_path / "increments.i50n"
-    path.write_bytes(b"I50N" + bytes(200))
-    with pytest.raises(InputError, match=r"increments\.i50n"):
+    path.write_bytes(b"I50N\x01" + bytes(200))
+    words = r"increments\.i50n: .*they are compensated already and hold no pulses"
+    with pytest.raises(InputError, match=words):
         solve(captures=[path])
 
 

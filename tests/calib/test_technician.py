@@ -170,7 +170,7 @@ CLUMSY = {
         [
             ("z-up", 1, "alignment interrupted after 40 s: the unit moved (0.06 deg/s, limit 0.05)"),
             ("x-up", 1, "wrong direction: -40 deg, expected +180"),
-            ("y-up", 1, "turned 150.0 deg, want 180 +- 5"),
+            ("y-up", 1, "turned 150.0 deg, expected 180 +- 5"),
         ],
         [
             "WRONG WAY",
@@ -181,7 +181,7 @@ CLUMSY = {
     "turns slowly, bumps the bench, puts the wrong side up": (
         [Mistake("z-up", "slow"), Mistake("x-up", "bump"), Mistake("y-up", "wrong pose")],
         [
-            ("z-up", 1, "peak 42 deg/s: slower than 60, expect 4.2 mm"),
+            ("z-up", 1, "peak 42 deg/s: slower than 60, an error of about 4.2 mm"),
             ("x-up", 1, "rest interrupted after 4.0 s of 15: the unit moved (0.58 deg/s, limit 0.05)"),
         ],
         [
@@ -258,10 +258,10 @@ def test_a_mistake_in_one_of_several_turns_is_named_and_the_run_is_used(name: st
     if "slow" in kinds:
         assert outside == [
             ("z-up", 2, "wrong direction: +40 deg, expected -180"),
-            ("x-up", 3, "peak 42 deg/s: slower than 120, expect 4.2 mm"),
+            ("x-up", 3, "peak 42 deg/s: slower than 120, an error of about 4.2 mm"),
         ]
     else:
-        assert outside == [("z-up", 4, "turned 150.0 deg, want 180 +- 5")]
+        assert outside == [("z-up", 4, "turned 150.0 deg, expected 180 +- 5")]
     assert_identified(done)
 
 

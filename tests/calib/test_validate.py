@@ -273,6 +273,7 @@ def test_the_report_has_verdict_figures_and_both_navigations(rotation: tuple[Tri
     assert max(map(len, text.splitlines())) <= 80
     assert f"reduced by {metrics.reduction:.2%}, required 95%" in " ".join(text.split())
     assert "good  rotation" in text
+    assert "difference from the twin" in text
     assert "bad   <b>slow" in text
     assert "\x1b" not in text
     assert "unit &lt;7&gt;" in page
@@ -299,7 +300,9 @@ def test_a_recorded_run_is_metrics_by_the_command(
 
     short_alignment = ["--align", f"{ALIGN_S:g}"]
     assert validate("unit.yaml", *short_alignment, "--report", str(tmp_path / "r.html")) == 0
-    assert "good  turn.raw: horizontal velocity" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "good  turn.raw: horizontal velocity" in said
+    assert "twin" not in said.lower()  # a recording has none
     assert "turn.raw" in (tmp_path / "r.html").read_text()
     assert validate("other.yaml", *short_alignment) == 3
     assert "bad  turn.raw: horizontal" in capsys.readouterr().out

@@ -1,18 +1,15 @@
 "use strict";
 // Shows the frames of the session and sends the buttons. Everything that is shown comes from the server.
-const $ = (id) => document.getElementById(id);
-const token = new URLSearchParams(location.search).get("token") || "";
 const SIZE = [150, 200, 100];  // of the unit along X, Y, Z, px
 const KEPT = 1200;             // frames in the plots: 60 s at 20 Hz
 const TONES = { good: 880, bad: 196, ready: 660, turn: 523 };
-let hello = null, view = null, result = null, reports = null, lines = [], acting = false, ended = false, asked = null, socket = null;
-let language = "en", sounds = true, audio = null, bells = null, wasReady = false, wasActing = false;
+let view = null, result = null, reports = null, lines = [], acting = false, ended = false, asked = null;
+let sounds = true, audio = null, bells = null, wasReady = false;
 const done = new Set();  // steps that were accepted; the verification is a procedure of its own
 const history = { rate: [], force: [], stillness: [] };
 
 const inLanguage = (texts) => (texts ? texts[language] || texts.en : "");
-const label = (name) => (hello ? hello.labels[language][name] || "" : "");
-const send = (content) => socket && socket.readyState === 1 && socket.send(JSON.stringify(content));
+const send = (content) => isLost() || socket.send(JSON.stringify(content));
 
 function element(name, attributes, parent, namespace) {
   const made = namespace ? document.createElementNS(namespace, name) : document.createElement(name);
@@ -83,28 +80,11 @@ function drawDial() {
   $("degrees").textContent = view.angle === null ? "–" : `${view.angle.toFixed(1)}°`;
   $("speed").textContent = `${Math.abs(view.rate).toFixed(0)} °/s`;
 }
-function drawPlot(id) {
-  const canvas = $(id), values = history[id], scale = devicePixelRatio || 1;
-  const w = canvas.clientWidth * scale, h = canvas.clientHeight * scale;
-  if (canvas.width !== w || canvas.height !== h) [canvas.width, canvas.height] = [w, h];
-  const pen = canvas.getContext("2d"), style = getComputedStyle(document.documentElement);
-  const known = values.filter((v) => v !== null);
-  let low = Math.min(...known), high = Math.max(...known);
-  if (id === "stillness") [low, high] = [0, 1];
-  if (id === "rate") [low, high] = [0, Math.max(5, high)];
-  if (id === "force" && high - low < 0.1) [low, high] = [(low + high - 0.1) / 2, (low + high + 0.1) / 2];
-  pen.clearRect(0, 0, w, h);
-  if (!known.length) return;
-  pen.fillStyle = style.getPropertyValue("--dim");
-  pen.font = `${11 * scale}px sans-serif`;
-  const shown = (v) => v.toFixed(id === "rate" ? 0 : 2), room = 42 * scale, y = (v) => h - 4 - (h - 8) * (v - low) / (high - low);
-  pen.fillText(shown(high), 0, 12 * scale);
-  pen.fillText(shown(low), 0, h - 3);
-  pen.strokeStyle = style.getPropertyValue("--do");
-  pen.lineWidth = 1.5 * scale;
-  pen.beginPath();
-  values.forEach((v, k) => v !== null && pen.lineTo(room + (w - room) * (k + KEPT - values.length) / KEPT, y(v)));
-  pen.stroke();
+function drawPlots() {
+  const [, most] = range(history.rate, 0);
+  drawPlot($("rate"), history.rate, KEPT, [0, Math.max(5, most), 0]);
+  drawPlot($("force"), history.force, KEPT, [...range(history.force, 0.1), 2]);
+  drawPlot($("stillness"), history.stillness, KEPT, [0, 1, 2]);
 }
 function beep(frequency, seconds) {
   if (!sounds) return;
@@ -126,16 +106,18 @@ function sound() {
   bells = view.bells;
   wasReady = ready;
 }
-const width = (text) => [...text].reduce((sum, c) => sum + (c > "\u2e80" ? 1.75 : 1), 1);
+const pen = document.createElement("canvas").getContext("2d");
+function width(text) {  // in units of the font's size
+  pen.font = `800 100px ${getComputedStyle(document.body).fontFamily}`;
+  return pen.measureText(text).width / 100;
+}
 function drawText() {
-  const lost = !socket || socket.readyState !== 1;
-  for (const one of document.querySelectorAll("[data-label]")) one.textContent = label(one.dataset.label);
-  for (const one of document.querySelectorAll("[data-title]")) one.title = label(one.dataset.title);
+  const lost = isLost();
+  drawLabels();
   $("link").textContent = lost ? `○ ${label("lost")}` : `● ${label(acting ? "acting" : "viewing")}`;
-  document.documentElement.lang = language.replace("_", "-");
   const big = lost ? label("lost") : ended ? label("over") : view ? inLanguage(view.big) : "";
   $("headline").textContent = big;
-  $("headline").style.setProperty("--width", width(big));
+  $("headline").style.setProperty("--width", width(big) || 1);
   const why = view ? (view.reasons.length ? view.reasons : view.hints.slice(0, 1)) : [];
   const rejected = view && view.phase === "verdict" && view.tone === "bad";
   const texts = rejected ? [...view.reasons, ...view.hints] : why;
@@ -182,7 +164,7 @@ function drawResult() {
   if (result.gauge) element("caption", {}, $("arms")).textContent = label("points").replace("{gauge}", result.gauge);
   for (const [mark, text] of result.verdicts) {
     const line = element("li", { class: mark }, $("verdicts"));
-    element("b", {}, line).textContent = `${label(mark)}: `;
+    element("b", {}, line).textContent = label(mark);
     line.append(inLanguage(text));
   }
   if (!result.r_mm) return;
@@ -202,6 +184,8 @@ function drawResult() {
 }
 function draw() {
   if (!hello) return;
+  $("unit").textContent = hello.unit;
+  $("simulated").hidden = !hello.simulated;
   drawText();
   drawButtons();
   if (view) drawSteps();
@@ -210,23 +194,13 @@ function frame() {
   draw();
   drawPose();
   drawDial();
-  for (const [id, value] of [["rate", Math.abs(view.rate)], ["force", view.force], ["stillness", view.stillness]]) {
-    history[id].push(value);
-    if (history[id].length > KEPT) history[id].shift();
-    drawPlot(id);
-  }
+  keep(history.rate, Math.abs(view.rate), KEPT);
+  keep(history.force, view.force, KEPT);
+  keep(history.stillness, view.stillness, KEPT);
+  drawPlots();
   sound();
-  document.body.dataset.frames = Number(document.body.dataset.frames || 0) + 1;
 }
 const taken = {
-  hello(content) {
-    hello = content;
-    language = localStorage.getItem("language") || content.language;
-    $("language").value = language;
-    $("unit").textContent = content.unit;
-    $("simulated").hidden = !content.simulated;
-    draw();
-  },
   view(content) {
     if (!hello) return;
     const first = view === null || ended;
@@ -240,7 +214,7 @@ const taken = {
     frame();
   },
   acting(content) {
-    acting = wasActing = content.acting;
+    acting = content.acting;
     $("take").hidden = acting || !content.free;
     if (!acting) close();
     draw();
@@ -261,19 +235,6 @@ const taken = {
     drawResult();
   },
 };
-function connect() {
-  socket = new WebSocket(`${location.origin.replace("http", "ws")}/ws?token=${encodeURIComponent(token)}`);
-  socket.onopen = draw;
-  socket.onmessage = (event) => {
-    const content = JSON.parse(event.data);
-    taken[content.kind](content);
-  };
-  socket.onclose = () => {
-    acting = false;
-    draw();
-    setTimeout(connect, 1000);
-  };
-}
 function act(action) {
   if (!acting || !view || !view.actions.includes(action)) return;
   const content = { action, step: view.step };
@@ -303,12 +264,6 @@ $("theme").onclick = () => {
   document.documentElement.dataset.theme = dark ? "dark" : "light";
   localStorage.setItem("theme", dark ? "dark" : "light");
 };
-$("language").onchange = (event) => {
-  language = event.target.value;
-  localStorage.setItem("language", language);
-  draw();
-  drawResult();
-};
 addEventListener("keydown", (event) => {
   if (asked) {
     if (event.key === "y") $("yes").click();
@@ -323,4 +278,8 @@ new ResizeObserver(fit).observe($("scene"));  // which is also hidden and shown 
 const wanted = localStorage.getItem("theme")
   || (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
 document.documentElement.dataset.theme = wanted;
-connect();
+live(taken, () => {
+  if (isLost()) acting = false;
+  draw();
+  drawResult();
+});
