@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from samples import CERTIFICATE
+from samples import CERTIFICATE, PROCEDURE
 
 from imudrv import profiles
 from imudrv.compilation import PARTS, remove_unused
@@ -216,6 +216,7 @@ def test_after_the_warm_up_no_command_compiles_a_kernel(first_command: Filled, t
     cache = first_command.folder
     (tmp_path / "unit.yaml").write_text(CERTIFICATE)
     (tmp_path / "site.yaml").write_text("{latitude_deg: 28.2, longitude_deg: 113.0, height_m: 60.0}")
+    (tmp_path / "short.yaml").write_text(PROCEDURE)
     files = sorted(cache.rglob("*.kernel"))
     for line in (
         "imudrv sim x-up --profile imu50-rs422 -o x.raw",
@@ -236,7 +237,7 @@ def test_after_the_warm_up_no_command_compiles_a_kernel(first_command: Filled, t
         "imudrv export z.mcap --to imr -o z.imr",
         "calib identify x.raw y.raw z.raw --profile imu50-rs422 --calibration unit.yaml --site site.yaml "
         "-o new.yaml",
-        "calib run --rehearse --speed max --session session",
+        "calib run --rehearse --procedure short.yaml --speed max --session session",
         "calib validate --simulate rotation",
     ):
         done = run("-m", *line.split(), cwd=tmp_path, NUMBA_CACHE_DIR=str(cache))

@@ -519,7 +519,7 @@ def test_a_sample_that_is_missing_in_the_turn_rejects_it(drive: Drive, turned: R
     driver = drive().feed(np.delete(turned, [during]))
 
     (rejected,) = driver.of(Rejected)
-    assert reasons(rejected) == ["1 samples missing during the rotation, expected at most 0"]
+    assert reasons(rejected) == ["1 sample missing during the rotation, expected at most 0"]
     assert driver.phases[-2:] == ["verdict", "place"]
 
 
