@@ -62,17 +62,3 @@ def parse_json(text: str) -> Any:
         return dict(pairs)
 
     return json.loads(text, object_pairs_hook=keyed)
-
-
-# The alignment is short: the joint estimate determines most of heading and biases again.
-PROCEDURE = """
-format: imu50-procedure
-version: 1
-name: short
-align_s: 40
-rest_s: 8
-poses:
-  - {id: z-up, up: +Z, east: +X, turn_deg: 180}
-  - {id: x-up, up: +X, east: +Y, turn_deg: 180}
-  - {id: y-up, up: +Y, east: +Z, turn_deg: 180}
-"""

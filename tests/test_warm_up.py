@@ -12,7 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from samples import CERTIFICATE, PROCEDURE
+from bench_session import SHORT
+from samples import CERTIFICATE
 
 from imudrv import profiles
 from imudrv.compilation import PARTS, remove_unused
@@ -216,7 +217,7 @@ def test_after_the_warm_up_no_command_compiles_a_kernel(first_command: Filled, t
     cache = first_command.folder
     (tmp_path / "unit.yaml").write_text(CERTIFICATE)
     (tmp_path / "site.yaml").write_text("{latitude_deg: 28.2, longitude_deg: 113.0, height_m: 60.0}")
-    (tmp_path / "short.yaml").write_text(PROCEDURE)
+    (tmp_path / "short.yaml").write_text(SHORT)
     files = sorted(cache.rglob("*.kernel"))
     for line in (
         "imudrv sim x-up --profile imu50-rs422 -o x.raw",
