@@ -43,6 +43,11 @@ def reference(data: Path) -> Path:
     return data / "reference"
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with what takes minutes in one worker: the others would wait for it at the end."""
+    items.sort(key=lambda item: item.path.name != "test_warm_up.py")
+
+
 @contextmanager
 def _replaced_at_random(
     path: Path, contents: Sequence[bytes], seed: int, removed: float = 0.0
