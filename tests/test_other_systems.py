@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from bench_session import SHORT
 from realtime import DEADLINE_S, free_port
 from samples import CERTIFICATE
 
@@ -193,7 +194,9 @@ def test_doctor_examines_what_it_can(folder: Path) -> None:
 
 
 def test_a_rehearsal_leads_to_a_certificate(folder: Path) -> None:
-    done = run(folder, "run", "--rehearse", "--speed", "max", "--session", "s", program="calib")
+    (folder / "short.yaml").write_text(SHORT)
+    options = ["--procedure", "short.yaml", "--speed", "max", "--session", "s"]
+    done = run(folder, "run", "--rehearse", *options, program="calib")
     assert done.returncode == 0, done.stdout + done.stderr
     assert run(folder, "verify", "s", program="calib").returncode == 0
     assert not list(folder.glob("imu50/*"))
